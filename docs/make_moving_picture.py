@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 
 import toftrack
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.views.skeleton import draw_hands
 
 MADE = Path(__file__).parent / "tracked.webp"

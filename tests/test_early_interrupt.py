@@ -38,7 +38,7 @@ def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.Complete
     )
 
 
-@pytest.mark.parametrize("moment", ["hydra", "omegaconf", "toftrack.devices.sample", "torch"])
+@pytest.mark.parametrize("moment", ["hydra", "omegaconf", "toftrack.devices.replay", "torch"])
 def test_an_interrupt_while_tracking_is_loaded(tmp_path: Path, moment: str) -> None:
     words = (str(ROOT / "track.py"), "view=none", f"hydra.run.dir={tmp_path / 'run'}")
     reported = interrupted(tmp_path, moment, *words)

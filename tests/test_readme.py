@@ -30,7 +30,7 @@ from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 
 from toftrack.api import make_device
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.estimate import no_estimate
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import json_line

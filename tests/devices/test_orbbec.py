@@ -14,7 +14,7 @@ from helpers.tracking import ROOT
 from helpers.videos import RATIONAL
 
 from toftrack.camera import Camera
-from toftrack.devices.orbbec.sdk import load_sdk
+from toftrack.devices.orbbec.device import load_sdk
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 
@@ -71,7 +71,9 @@ def test_as_a_bag_of_ros_it_is_refused_with_whose_it_is(recording: Path) -> None
 
 
 def test_the_sdk_leaves_standard_output_and_the_folder_alone(tmp_path: Path) -> None:
-    code = "from toftrack.devices.orbbec.sdk import load_sdk; load_sdk().Context(); print('mine')"
+    code = (
+        "from toftrack.devices.orbbec.device import load_sdk; load_sdk().Context(); print('mine')"
+    )
     done = subprocess.run(
         [sys.executable, "-c", code],
         cwd=tmp_path,

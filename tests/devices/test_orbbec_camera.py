@@ -20,6 +20,9 @@ LENS = (0.1, -0.2, 0.05, 0.3, -0.04, 0.01, 0.001, -0.002)
 """k1 to k6, p1, p2."""
 
 
+Plug = Callable[..., Sdk]
+
+
 def a_camera(
     serial: str = "0042", numbers: tuple[int, ...] = (), infrared: str | None = IR
 ) -> FakeCamera:
@@ -32,7 +35,7 @@ def a_camera(
 
 
 @pytest.fixture
-def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sdk]:
+def plug(monkeypatch: pytest.MonkeyPatch) -> Plug:
     def installed(*cameras: FakeCamera, **changes: Any) -> Sdk:
         sdk = Sdk(*cameras, **changes)
         monkeypatch.setitem(sys.modules, "pyorbbecsdk", sdk)
@@ -41,7 +44,7 @@ def plug(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Sdk]:
     return installed
 
 
-def test_frames_are_metres_infrared_and_seconds(plug: Callable[..., Sdk]) -> None:
+def test_frames_are_metres_infrared_and_seconds(plug: Plug) -> None:
     camera = a_camera(numbers=(70, 71, 72))
     plug(camera)
     device = orbbec(keep="every", stop=3)
@@ -59,16 +62,14 @@ def test_frames_are_metres_infrared_and_seconds(plug: Callable[..., Sdk]) -> Non
 
 
 @pytest.mark.parametrize("infrared", [LEFT_IR, None])
-def test_infrared_is_the_left_cameras_or_none(
-    plug: Callable[..., Sdk], infrared: str | None
-) -> None:
+def test_infrared_is_the_left_cameras_or_none(plug: Plug, infrared: str | None) -> None:
     plug(a_camera(numbers=(1,), infrared=infrared))
     frame = next(iter(orbbec(keep="every", stop=1)))
     assert (frame.amplitude is None) == (infrared is None)
     assert next(iter(orbbec(keep="every", stop=1, infrared=False))).amplitude is None
 
 
-def test_dropped_frames_leave_a_gap_and_a_camera_may_count_anew(plug: Callable[..., Sdk]) -> None:
+def test_dropped_frames_leave_a_gap_and_a_camera_may_count_anew(plug: Plug) -> None:
     camera = a_camera(numbers=(70, 71, 74, 3, 4, 9_000_000))
     camera.sets.insert(2, Images(None))  # the infrared image came alone
     plug(camera)
@@ -78,20 +79,20 @@ def test_dropped_frames_leave_a_gap_and_a_camera_may_count_anew(plug: Callable[.
     assert [frame.index for frame in orbbec(keep="every", start=4, stop=6)] == [4, 5]
 
 
-def test_the_newest_frame_wins(plug: Callable[..., Sdk]) -> None:
+def test_the_newest_frame_wins(plug: Plug) -> None:
     camera = a_camera(numbers=tuple(range(100)))
     plug(camera)
     device = orbbec(stop=100)
-    indices = []
+    numbers = []
     for frame in device:
-        indices.append(frame.depth[0, 0] / np.float32(0.25e-3))
+        numbers.append(round(float(frame.depth[0, 0] / np.float32(0.25e-3))))
         assert camera.begun.wait(10)  # all were sent while this one was being tracked
-        if round(float(indices[-1])) == 99:  # it may have been the first that was taken
+        if numbers[-1] == 99:  # it may have been the first that was taken
             break
-    assert len(indices) <= 2 and round(float(indices[-1])) == 99
+    assert len(numbers) <= 2 and numbers[-1] == 99
 
 
-def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Callable[..., Sdk]) -> None:
+def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Plug) -> None:
     camera = a_camera(numbers=(1, 2))
     plug(camera)
     indices = []
@@ -111,7 +112,7 @@ def test_an_unplugged_camera_is_reported_after_its_last_frame(plug: Callable[...
     ],
 )
 def test_a_camera_that_fails_is_reported(
-    plug: Callable[..., Sdk], sent: list[Images], error: str | None, words: str
+    plug: Plug, sent: list[Images], error: str | None, words: str
 ) -> None:
     camera = a_camera()
     camera.sets = sent
@@ -122,7 +123,7 @@ def test_a_camera_that_fails_is_reported(
 
 
 def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
-    plug: Callable[..., Sdk],
+    plug: Plug,
 ) -> None:
     camera = a_camera(numbers=(5, 6))
     plug(camera)
@@ -135,7 +136,7 @@ def test_leaving_stops_the_camera_and_iterating_again_starts_it_again(
     device.close()
 
 
-def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]) -> None:
+def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Plug) -> None:
     plug(a_camera("0042"), a_camera("CL77"))
     with pytest.raises(ToftrackError, match="2 Orbbec cameras.*device.serial=.*0042, CL77"):
         orbbec()
@@ -145,7 +146,7 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Callable[..., Sdk]
         orbbec(serial=5)
 
 
-def test_no_camera_and_one_without_depth_are_reported(plug: Callable[..., Sdk]) -> None:
+def test_no_camera_and_one_without_depth_are_reported(plug: Plug) -> None:
     plug()
     with pytest.raises(ToftrackError, match="no Orbbec camera.*udev.*device.bag"):
         orbbec()
@@ -155,7 +156,7 @@ def test_no_camera_and_one_without_depth_are_reported(plug: Callable[..., Sdk]) 
 
 
 def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
-    plug: Callable[..., Sdk],
+    plug: Plug,
 ) -> None:
     plug(a_camera())
     with pytest.raises(ToftrackError, match="width=641.*8x6 at 15, 8x6 at 30, 16x12 at 30"):
@@ -165,13 +166,13 @@ def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
 
 
 @pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_k6", None])
-def test_the_cameras_lens_becomes_opencvs(plug: Callable[..., Sdk], model: str | None) -> None:
+def test_the_cameras_lens_becomes_opencvs(plug: Plug, model: str | None) -> None:
     plug(FakeCamera("1", {DEPTH: [profile("y16", lens=LENS, model=model)]}))
-    k1, k2, k3, k4, k5, k6, p1, p2 = LENS
-    np.testing.assert_array_equal(orbbec().camera.distortion, (k1, k2, p1, p2, k3, k4, k5, k6))
+    found = orbbec().camera.distortion
+    np.testing.assert_array_equal(found, (*LENS[:2], *LENS[6:], *LENS[2:6]))
 
 
-def test_other_lenses_are_a_fisheye_none_or_reported(plug: Callable[..., Sdk]) -> None:
+def test_other_lenses_are_a_fisheye_none_or_reported(plug: Plug) -> None:
     plug(FakeCamera("1", {DEPTH: [profile("y16", lens=LENS, model="kannala_brandt4")]}))
     camera = orbbec().camera
     assert camera.lens == "fisheye"

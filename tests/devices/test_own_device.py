@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from toftrack.camera import Camera
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.base import BaseDevice, Device
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 
 FRAMES = 12

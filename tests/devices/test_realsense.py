@@ -15,10 +15,15 @@ from helpers.settings import realsense, realsense_emulator
 
 from toftrack.camera import Camera
 from toftrack.devices.base import Device
-from toftrack.devices.realsense.device import RealSense
+from toftrack.devices.realsense.device import (
+    RealSense,
+    camera_of,
+    choose_streams,
+    load_sdk,
+    set_preset,
+)
 from toftrack.devices.realsense.emulator import EmulatedCamera
-from toftrack.devices.realsense.sdk import camera_of, choose_streams, load_sdk, set_preset
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 
 FINE = realsense_emulator(fps=500.0, unit_m=0.0001)

@@ -7,26 +7,66 @@ import os
 import signal
 import threading
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import usb.core
-from helpers.settings import sr3000
-from helpers.sr3000_camera import STEP_M, camera, read
+from helpers import programs
+from helpers.programs import QUICK, interrupted_when
+from helpers.settings import persistence_settings, sr3000, sr3000_emulator, usb_settings
 
-from toftrack.devices.base import Device
-from toftrack.devices.sample import Sample
+from toftrack.camera import Camera
+from toftrack.devices.base import BaseDevice
+from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000 import usb as sr3000_usb
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.devices.sr3000.faults import REQUEST_FAULTS
+from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
+from toftrack.devices.sr3000.transport import Exposure
+from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
+from toftrack.recordings.store import open_source
+
+FAST = {"fps": 1000.0, "replug_s": 0.02, "late_s": 0.06}
+STEP_M = unambiguous_range_m(20) / 0xFFFF
+
+
+def camera(*faults: str, keep: str = "every", **changes: Any) -> Sr3000:
+    """A virtual camera that is fast, and whose driver is impatient."""
+    settings = {"faults": faults} | FAST
+    settings |= {k: changes.pop(k) for k in list(changes) if k in EmulatorSettings.__annotations__}
+    persistence = {"first_frame_s": 0.6, "give_up_s": 0.6, "backoff_s": 0.01} | changes.pop(
+        "persistence", {}
+    )
+    usb_ = {"timeout_ms": 40, "drain_ms": 3, "tail_check_ms": 1} | changes.pop("usb", {})
+    return sr3000(
+        transport="emulated",
+        keep=keep,
+        emulated=sr3000_emulator(**settings),
+        persistence=persistence_settings(**persistence),
+        usb=usb_settings(**usb_),
+        **changes,
+    )
+
+
+def read(device: Sr3000) -> list[Any]:
+    """The frames of a virtual camera that is then closed, with a look at what was left behind."""
+    with device:
+        frames = list(device)
+    assert_released(device)
+    return frames
 
 
 @pytest.fixture(scope="module")
 def sample() -> list[Any]:
     return list(Sample())
+
+
+def assert_released(device: Sr3000) -> None:
+    assert device.emulator.open_handles == set()
+    assert device.emulator.misuse == []
 
 
 def assert_is_the_sample(device: Sr3000, frames: list[Any], sample: list[Any]) -> None:
@@ -39,7 +79,7 @@ def assert_is_the_sample(device: Sr3000, frames: list[Any], sample: list[Any]) -
 
 def test_serves_the_sample_whole_and_in_order(sample: list[Any]) -> None:
     device = camera()
-    assert isinstance(device, Device)
+    assert isinstance(device, BaseDevice)
     frames = read(device)
     assert [frame.index for frame in frames] == list(range(100))
     assert (np.diff([frame.timestamp_s for frame in frames]) >= 0).all()
@@ -108,11 +148,9 @@ def test_a_frame_in_two_transfers_at_every_packet(sample: list[Any]) -> None:
     ("kind", "distance"), [("zeros", 0.0), ("ones", unambiguous_range_m(20)), ("garbage", None)]
 )
 def test_nonsense_of_the_right_length_is_a_frame(kind: str, distance: float | None) -> None:
-    device = camera(f"{kind}@1", stop=3)
-    frames = read(device)
+    frames = read(camera(f"{kind}@1", stop=3))
     assert [frame.index for frame in frames] == [0, 1, 2]
-    depth = device.camera.rectify(frames[1].depth, True)
-    assert np.isfinite(depth).all()
+    assert np.isfinite(frames[1].depth).all()
     if distance is not None:
         np.testing.assert_allclose(frames[1].depth, distance, rtol=1e-6)
 
@@ -178,8 +216,7 @@ def test_a_camera_that_cannot_be_opened_is_reported(kind: str, words: str) -> No
     device = camera(kind)
     with pytest.raises(ToftrackError, match=words):
         device.open()
-    assert device.emulator.open_handles == set()
-    assert device.emulator.misuse == []
+    assert_released(device)
 
 
 @pytest.mark.parametrize("kind", ["permission", "busy"])
@@ -206,8 +243,7 @@ def test_close_twice_and_open_again() -> None:
         assert next(iter(device)).index == 0
         device.close()
         device.close()
-        assert device.emulator.open_handles == set()
-    assert device.emulator.misuse == []
+        assert_released(device)
 
 
 def test_iterating_again_goes_on() -> None:
@@ -226,16 +262,10 @@ def test_iterating_again_goes_on() -> None:
 
 def test_an_exception_in_the_consumer_releases_the_camera() -> None:
     device = camera(loop=True)
-
-    def consume() -> None:
-        with device:
-            for _ in device:
-                raise RuntimeError("the consumer's own")
-
-    with pytest.raises(RuntimeError, match="the consumer's own"):
-        consume()
-    assert device.emulator.open_handles == set()
-    assert device.emulator.misuse == []
+    with pytest.raises(RuntimeError, match="the consumer's own"), device:
+        for _ in device:
+            raise RuntimeError("the consumer's own")
+    assert_released(device)
 
 
 def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
@@ -244,8 +274,7 @@ def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
     with pytest.raises(KeyboardInterrupt), device:
         for _ in device:
             pass
-    assert device.emulator.open_handles == set()
-    assert device.emulator.misuse == []
+    assert_released(device)
 
 
 def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted() -> None:
@@ -299,6 +328,116 @@ def test_every_kind_of_fault_in_turn_and_every_good_frame_accounted_for() -> Non
     assert len(frames) > 40
 
 
-def test_every_kind_of_fault_is_tested() -> None:
-    tested = {kind for kind, *_ in PASSING} | {"late", "split", "zeros", "ones", "garbage"}
-    assert tested == set(REQUEST_FAULTS)
+# Settings.
+
+
+def test_settings_reach_the_camera() -> None:
+    device = camera(
+        modulation_mhz=30,
+        integration_time=20,
+        usb={"registers": {"3": 7}, "integration_time_register": 5, "modulation_register": 6},
+        stop=2,
+    )
+    read(device)
+    assert bytes(device.emulator.registers[:8]) == bytes((0, 0, 0, 7, 0, 20, 1, 0))
+
+
+def test_modulation_frequency_sets_the_range() -> None:
+    device = camera(modulation_mhz=40, stop=1)
+    frame = read(device)[0]
+    depth = device.camera.rectify(frame.depth, True)
+    np.testing.assert_allclose(depth, next(iter(Sample())).depth, atol=0.51 * STEP_M)
+    assert device.exposure.range_m == pytest.approx(3.747, abs=1e-3)
+
+
+def test_amplitude_threshold_takes_the_distance_of_dim_pixels() -> None:
+    dim = read(camera(stop=1))[0].amplitude < 500
+    frame = read(camera(amplitude_threshold=500, stop=1))[0]
+    assert dim.any()
+    assert (frame.depth[dim] == 0).all()
+    assert (frame.depth[~dim] > 0).mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    ("has", "asked", "words"),
+    [
+        ({"endpoint_in": 0x81}, {}, "no endpoint 0x86 .it has 0x02, 0x81"),
+        ({"endpoint_out": 0x03}, {"registers": {1: 2}}, "no endpoint 0x02 .it has 0x03, 0x86"),
+        ({}, {"registers": {1: 2}}, "register 1 "),
+    ],
+)
+def test_a_camera_with_other_endpoints_or_registers_is_reported(
+    has: dict[str, Any], asked: dict[str, Any], words: str
+) -> None:
+    backend = EmulatedBackend(open_source("sample"), sr3000_emulator(), 7.5, usb_settings(**has))
+    backend.bulk_write = lambda *_: (_ for _ in ()).throw(usb.core.USBError("Pipe error", -9, 32))
+    transport = UsbTransport(usb_settings(**asked), Exposure(20, None, 0), None, backend)
+    with pytest.raises(ToftrackError, match=words):
+        transport.open()
+    assert backend.open_handles == set()
+
+
+def test_what_a_killed_program_left_in_the_camera_is_not_a_frame() -> None:
+    device = camera(stop=3)
+    device.emulator._request()  # asked for, but never fetched
+    time.sleep(0.01)
+    frames = read(device)
+    (second,) = Sample(start=1, stop=2)
+    assert np.array_equal(frames[0].amplitude, second.amplitude)
+
+
+def test_camera_file_replaces_the_optics(tmp_path: Any) -> None:
+    path = tmp_path / "camera.json"
+    Camera(np.array([[210.0, 0, 90], [0, 210, 70], [0, 0, 1]]), 176, 144).save(path)
+    assert camera(camera_file=path).camera.K[0, 0] == 210
+    Camera(np.eye(3), 10, 10).save(path)
+    with pytest.raises(ToftrackError, match="10x10"):
+        camera(camera_file=path)
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: sr3000("ethernet"), "usb, libmesasr or emulated"),
+        (lambda: sr3000("emulated", modulation_mhz=25), "40, 30, 21, 20, 19"),
+        (lambda: sr3000("emulated", integration_time=256), "at least 0 and at most 255"),
+        (lambda: usb_settings(ids=("1ad2",)), "VENDOR:PRODUCT"),
+        (lambda: usb_settings(registers={64: 0}), "at least 0 and at most 63"),
+        (lambda: sr3000_emulator(faults=("explode@3",)), "explode"),
+        (lambda: sr3000_emulator(faults=("timeout@x",)), "timeout@x"),
+        (lambda: persistence_settings(give_up_s=0), "give_up_s"),
+    ],
+)
+def test_bad_settings_are_reported(make: Any, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        make()
+
+
+# From the command line.
+
+EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")
+
+
+def track(folder: Path, *overrides: str) -> tuple[int, str, str]:
+    return programs.call(*EMULATED, *overrides, *QUICK, "hydra.run.dir=out", folder=folder)
+
+
+def test_tracks_through_faults_and_an_unplugged_cable(tmp_path: Path) -> None:
+    faults = "device.emulated.faults=[unplug_during@6,short@9,zeros@12,timeout@14]"
+    usual = ("device.keep=every", "device.stop=24", "device.usb.timeout_ms=99")
+    status, out, err = track(tmp_path, faults, *usual)
+    assert status == 0, err
+    with np.load(tmp_path / "out" / "track.npz") as result:
+        assert len(result["joints_m"]) == 24
+        assert result["lost"][12]  # the frame without a reading
+        assert not result["lost"][-3:].any()
+    assert "22 delivered" in out + err
+
+
+def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
+    lines = tmp_path / "out" / "track.jsonl"
+    with interrupted_when(lambda: lines.exists() and lines.stat().st_size):
+        status, _, err = track(tmp_path, "device.emulated.loop=true")
+    assert status == 130
+    assert "interrupted" in err and "Traceback" not in err
+    assert (tmp_path / "out" / "track.npz").exists()

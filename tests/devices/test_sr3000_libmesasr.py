@@ -8,11 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.settings import (
-    mesa_settings,
-    persistence_settings,
-    sr3000,
-)
+from helpers.settings import mesa_settings, persistence_settings, sr3000
 
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError
@@ -74,11 +70,15 @@ int SR_SetModulationFrequency(Camera *c, int code) {
 """
 
 COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
-needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+
+Libraries = dict[str, Path]
 
 
 @pytest.fixture(scope="module")
-def libraries(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def libraries(tmp_path_factory: pytest.TempPathFactory) -> Libraries:
+    if COMPILER is None:
+        pytest.skip("there is no C compiler")
     folder = tmp_path_factory.mktemp("library")
     (folder / "mesa.c").write_text(SOURCE)
     paths = {}
@@ -98,38 +98,23 @@ def camera(library: Path | str, **changes: object) -> Sr3000:
     return sr3000("libmesasr", libmesasr=mesa, persistence=persistence, **settings)
 
 
-@needs_compiler
 def test_reads_frames_and_sets_the_camera_up(
-    libraries: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    libraries: Libraries, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = tmp_path / "calls"
     monkeypatch.setenv("STAND_IN_LOG", str(log))
-    device = camera(
-        libraries["whole"],
-        serial="0x2a",
-        modulation_mhz=30,
-        integration_time=12,
-        amplitude_threshold=3,
-    )
-    with device:
+    settings = {"modulation_mhz": 30, "integration_time": 12, "amplitude_threshold": 3}
+    with camera(libraries["whole"], serial="0x2a", **settings) as device:
         frames = list(device)
     assert [frame.index for frame in frames] == [0, 1, 2, 3, 4]
     for number, frame in enumerate(frames, start=1):
         words = frame.depth.ravel()[:100] / (device.exposure.range_m / 0xFFFF)
         np.testing.assert_allclose(words, np.arange(100) + number, atol=1e-3)
         assert (frame.amplitude == 7 * number).all()
-    assert log.read_text().split("\n")[:-1] == [
-        "open 42",
-        "timeout 50",
-        "mode 5",
-        "modulation 1",
-        "floor 3",
-        "time 12",
-        "close 0",
-    ]
+    calls = "open 42, timeout 50, mode 5, modulation 1, floor 3, time 12, close 0"
+    assert log.read_text().splitlines() == calls.split(", ")
 
 
-@needs_compiler
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
@@ -141,17 +126,16 @@ def test_reads_frames_and_sets_the_camera_up(
     ],
 )
 def test_what_goes_wrong_is_reported(
-    libraries: dict[str, Path], fault: str, words: str, monkeypatch: pytest.MonkeyPatch
+    libraries: Libraries, fault: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_FAULT", fault)
     with pytest.raises(ToftrackError, match=words), camera(libraries["whole"]) as device:
         list(device)
 
 
-@needs_compiler
 @pytest.mark.parametrize(("fault", "unanswered"), [("once", 1), ("gone", 2)])
 def test_recovers(
-    libraries: dict[str, Path], fault: str, unanswered: int, monkeypatch: pytest.MonkeyPatch
+    libraries: Libraries, fault: str, unanswered: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_FAULT", fault)
     # The stand-in counts how often it was opened, so each fault needs a copy of its own.
@@ -162,17 +146,15 @@ def test_recovers(
     assert device.counts.unanswered == unanswered
 
 
-@needs_compiler
-def test_a_library_that_lacks_a_function_is_reported(libraries: dict[str, Path]) -> None:
+def test_a_library_that_lacks_a_function_is_reported(libraries: Libraries) -> None:
     with pytest.raises(ToftrackError, match="no function SR_SetModulationFrequency"):
         camera(libraries["incomplete"])
 
 
-def test_no_library_is_reported() -> None:
-    with pytest.raises(ToftrackError, match="libnowhere.so.*vendor's package.*transport=usb"):
-        camera("libnowhere.so")
-
-
-def test_a_serial_that_is_no_number_is_reported() -> None:
-    with pytest.raises(ToftrackError, match="SN-12 is not a number"):
-        camera("libnowhere.so", serial="SN-12")
+@pytest.mark.parametrize(
+    ("serial", "words"),
+    [(None, "libnowhere.so.*vendor's package.*transport=usb"), ("SN-12", "SN-12 is not a number")],
+)
+def test_no_library_and_no_number_are_reported(serial: str | None, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        camera("libnowhere.so", serial=serial)

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.configuration.compose import configuration
-from toftrack.devices.replay import Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, read_labels
 from toftrack.evaluation.labelling import LABELLED, LabelFile, chosen_frames, label_frames, track

@@ -16,7 +16,7 @@ from helpers.settings import browser_view
 from helpers.tracking import make_tracker
 from websockets.sync.client import connect
 
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.views.base import TrackedFrame
 from toftrack.views.browser.view import BrowserView
 

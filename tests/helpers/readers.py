@@ -21,8 +21,7 @@ from toftrack.configuration.compose import configuration
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import onnx_file, read_session
 from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights
-from toftrack.devices.replay import Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA, open_data_set
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
@@ -36,11 +35,10 @@ from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose
 from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
 from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.npz_pieces import compressed
 from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
-from toftrack.recordings.unfinished import Facts, UnfinishedRecording, recover_recording
+from toftrack.recordings.unfinished import Facts, UnfinishedRecording, compressed, recover_recording
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 _MOST_FRAMES = 4

@@ -26,7 +26,7 @@ from helpers.programs import QUICK
 from helpers.settings import stdout_stream, udp_stream
 from helpers.tracking import CONF, ROOT, configuration, run
 
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.output.lines import LINE_FIELDS, json_line

@@ -77,7 +77,7 @@ def app(tmp_path: Path) -> Path:
         'defaults: [_self_, {device: sample}]\nfail: ""\nseed: 1\n'
     )
     (folder / "conf" / "device" / "sample.yaml").write_text(
-        "_target_: toftrack.devices.sample.Sample\n"
+        "_target_: toftrack.devices.replay.Sample\n"
     )
     (folder / "conf" / "device" / "replay.yaml").write_text(
         "_target_: toftrack.devices.replay.Replay\npath: ???\n"

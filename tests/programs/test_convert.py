@@ -14,8 +14,7 @@ from helpers.tracking import ROOT
 from helpers.videos import write_grey
 
 from toftrack.camera import Camera
-from toftrack.devices.replay import Folder, Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Folder, Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert, record
 from toftrack.recordings.bare import BareFacts

@@ -10,7 +10,7 @@ import pytest
 from helpers.tracking import run
 
 from toftrack.devices.base import BaseDevice
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.frames import Frame
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -20,9 +20,8 @@ from helpers.settings import orbbec, realsense, realsense_emulator, sr3000, sr30
 from helpers.tracking import ROOT, run
 
 from toftrack.devices.base import BaseDevice, Device
-from toftrack.devices.realsense.sdk import load_sdk
-from toftrack.devices.replay import Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.realsense.device import load_sdk
+from toftrack.devices.replay import Replay, Sample
 from toftrack.devices.synthetic import Synthetic
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame

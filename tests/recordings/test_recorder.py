@@ -278,15 +278,10 @@ def test_another_unit_is_reported_at_the_beginning(tmp_path: Path) -> None:
 
 
 def test_frames_that_do_not_fit_those_before_end_it(tmp_path: Path) -> None:
-    for number, other in enumerate(
-        (
-            one_frame(depth=np.ones((HEIGHT, 7), np.float32)),
-            one_frame(radial=True),
-            one_frame(amplitude=np.ones((3, 3), np.uint16)),
-        )
-    ):
+    small = {"depth": np.ones((HEIGHT, 7), np.float32)}
+    for number, other in enumerate((small, {"radial": True}, {"amplitude": np.ones((3, 3))})):
         path = tmp_path / f"{number}.npz"
-        recorder = recorded(path, one_frame(), other, one_frame())
+        recorder = recorded(path, one_frame(), one_frame(**other), one_frame())
         assert recorder.failed and "frame 0" in (recorder.ended or "")
         assert len(read_recording(path)) == 1
 

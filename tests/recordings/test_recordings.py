@@ -14,6 +14,7 @@ import pytest
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.recordings import npz
 from toftrack.recordings.npz import read_recording, write_recording
 
 T, H, W = 4, 6, 8
@@ -175,7 +176,6 @@ def a_single_array(path: Path) -> None:
 @pytest.mark.parametrize(
     ("harm", "words"),
     [
-        (lambda path: path.unlink(), "no file"),
         (lambda path: (path.unlink(), path.mkdir()), "is a directory"),
         (lambda path: path.write_bytes(b""), "it is no .npz archive"),
         (a_single_array, "it is no .npz archive"),
@@ -283,3 +283,44 @@ def test_what_breaks_the_format_is_reported_by_its_key(
 
 def test_a_recording_without_any_reading_is_valid(tmp_path: Path) -> None:
     assert len(read_recording(save(tmp_path, depth_m=np.nan * IMAGES))) == T
+
+
+LONG = np.random.default_rng(0).uniform(0.3, 1.0, (9, 60, 80)).astype(np.float32)
+
+
+@pytest.fixture
+def long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A recording that is too long to be loaded."""
+    monkeypatch.setattr(npz, "LOADED_BYTES", 100_000)
+    np.savez(
+        tmp_path / "long.npz", depth_m=LONG, K=np.array([[90.0, 0, 40], [0, 91, 30], [0, 0, 1]])
+    )
+    return tmp_path / "long.npz"
+
+
+def test_a_long_one_is_played_like_another(long: Path) -> None:
+    frames = list(Replay(long, start=2, stop=7))
+    assert [frame.index for frame in frames] == [2, 3, 4, 5, 6]
+    np.testing.assert_array_equal(np.stack([frame.depth for frame in frames]), LONG[2:7])
+
+
+def test_damage_on_the_way_is_reported_when_it_is_met(long: Path) -> None:
+    content = bytearray(long.read_bytes())
+    with zipfile.ZipFile(long) as archive:
+        at = archive.getinfo("depth_m.npy").header_offset + 170_000
+    content[at : at + 4] = b"\0\0\xc0\x7f"
+    long.write_bytes(content)
+    recording = read_recording(long)
+    with pytest.raises(ToftrackError, match="long.npz' is damaged .*CRC"):
+        for index in range(9):
+            recording.image(index)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"depth_m": np.asfortranarray(LONG)}, {"amplitude": LONG.astype(np.int32)}],
+)
+def test_what_cannot_be_read_in_turn_is_reported(long: Path, changes: dict) -> None:
+    np.savez(long, **{"depth_m": LONG, "K": K} | changes)
+    with pytest.raises(ToftrackError, match="long.npz"):
+        read_recording(long)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -26,7 +25,6 @@ from helpers.bags import (
     recording,
     write_bag,
 )
-from helpers.damage import damaged
 
 from toftrack.camera import Camera
 from toftrack.devices.replay import Bag, Replay
@@ -39,6 +37,7 @@ from toftrack.recordings.store import open_recording
 
 CAMERA = Camera(np.array([[40.0, 0, 15.5], [0, 41.0, 11.5], [0, 0, 1]]), 32, 24)
 COLOUR = "/camera/color/image_raw"
+JPEG = {"format": "16UC1; jpeg compressed bgr8", "data": np.zeros(9, np.uint8)}
 
 
 def some_depth(count: int = 6) -> np.ndarray:
@@ -75,7 +74,7 @@ def test_every_kind_of_bag_gives_the_frames_that_went_in(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_frames_come_in_any_order_and_from_the_middle(tmp_path: Path, kind: str) -> None:
+def test_messages_of_one_time_are_told_apart(tmp_path: Path, kind: str) -> None:
     depth = some_depth(9)
     messages = recording(depth, CAMERA)
     for message in messages[3:7]:
@@ -84,10 +83,6 @@ def test_frames_come_in_any_order_and_from_the_middle(tmp_path: Path, kind: str)
     for number in (4, 2, 3, 8, 0, 1):
         np.testing.assert_allclose(store.image(number)[0], depth[number], atol=1e-6)
     store.close()
-    np.testing.assert_allclose(store.image(5)[0], depth[5], atol=1e-6)
-    store.close()
-    frames = list(Replay(store.path, start=2, stop=4))
-    assert [frame.index for frame in frames] == [2, 3]
 
 
 def test_a_file_of_a_ros_2_bag_is_one_too_and_so_is_a_folder_without_metadata(
@@ -103,13 +98,9 @@ def test_a_file_of_a_ros_2_bag_is_one_too_and_so_is_a_folder_without_metadata(
         np.testing.assert_allclose(open_recording(folder).image(5)[0], depth[5], atol=1e-6)
 
 
-def test_a_camera_info_that_comes_late_is_used_from_the_first_frame_on(tmp_path: Path) -> None:
-    store = read_rosbag(write_bag(tmp_path, "mcap", recording(some_depth(), CAMERA, info_at=5)))
-    assert len(store) == 6
-    np.testing.assert_array_equal(store.camera.K, CAMERA.K)
-
-
-def test_without_a_camera_info_a_camera_file_serves(tmp_path: Path) -> None:
+def test_a_camera_info_may_come_late_and_without_one_a_camera_file_serves(tmp_path: Path) -> None:
+    late = write_bag(tmp_path, "mcap", recording(some_depth(), CAMERA, info_at=5))
+    np.testing.assert_array_equal(read_rosbag(late).camera.K, CAMERA.K)
     path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA, info_at=99))
     with pytest.raises(ToftrackError, match=f"no message of {INFO}.*camera.file=FILE"):
         read_rosbag(path)
@@ -156,17 +147,7 @@ def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
     [
         ([colour()], rf"no depth images.*{COLOUR} \(rgb8\)"),
         ([], "no depth images.*none"),
-        (
-            [
-                Message(
-                    "/depth/compressedDepth",
-                    COMPRESSED,
-                    {"format": "16UC1; jpeg compressed bgr8", "data": np.zeros(9, np.uint8)},
-                    recorded_ns(0),
-                )
-            ],
-            "no depth images.*jpeg",
-        ),
+        ([Message("/depth/compressedDepth", COMPRESSED, JPEG, recorded_ns(0))], "no depth.*jpeg"),
         (
             [Message("/device_0/sensor_0/Depth_0/image/data", IMAGE, {}, recorded_ns(0))],
             "camera's own program.*device=realsense device.bag=",
@@ -198,9 +179,8 @@ def test_images_of_another_unit_and_another_size_are_reported(tmp_path: Path) ->
         read_rosbag(path)
     messages = recording(depth, CAMERA)
     messages[4].fields = image(depth[0, :, :16])
-    (tmp_path / "b").mkdir()
     with pytest.raises(ToftrackError, match="frame 3 of.*16x24 pixels.*32x24"):
-        list(Bag(write_bag(tmp_path / "b", "bag", messages)))
+        list(Bag(write_bag(tmp_path, "mcap", messages)))
 
 
 def test_a_unit_can_be_given(tmp_path: Path) -> None:
@@ -211,10 +191,6 @@ def test_a_unit_can_be_given(tmp_path: Path) -> None:
         Bag(path, unit_m=-1.0)
 
 
-def cut(path: Path, share: float) -> None:
-    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-
-
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.3, 0.9, 0.999])
 @pytest.mark.parametrize("kind", KINDS)
 def test_bags_that_were_cut_off_are_reported_or_used_so_far(
@@ -222,7 +198,7 @@ def test_bags_that_were_cut_off_are_reported_or_used_so_far(
 ) -> None:
     path = write_bag(tmp_path, kind, recording(some_depth(40), CAMERA))
     file = path if path.is_file() else next(path.glob(f"*.{kind}"))
-    cut(file, share)
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
     try:
         device = Replay(path)
     except ToftrackError as error:
@@ -234,27 +210,12 @@ def test_bags_that_were_cut_off_are_reported_or_used_so_far(
         assert 0 < len(list(device)) <= (40 if share > 0.99 else 39)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_whatever_bytes_are_damaged_it_is_read_or_reported(tmp_path: Path, kind: str) -> None:
-    path = write_bag(tmp_path, kind, recording(some_depth(), CAMERA))
-    path = path if path.is_file() else next(path.glob(f"*.{kind}"))
-    content = path.read_bytes()
-    for seed in range(24):
-        path.write_bytes(damaged(content, seed))
-        with contextlib.suppress(ToftrackError):
-            store = open_recording(path)
-            for number in range(len(store)):
-                store.image(number)
-
-
 def test_what_is_no_bag_is_reported(tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     for name in ("a.bag", "a.mcap", "a.db3"):
         (tmp_path / name).write_bytes(b"nonsense" * 40)
         with pytest.raises(ToftrackError, match=f"{name}' cannot be read.*no bag"):
             Replay(tmp_path / name)
-    with pytest.raises(ToftrackError, match="there is no bag"):
-        Bag(tmp_path / "none.bag")
 
 
 def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -118,19 +118,6 @@ def test_little_endian_distance_then_amplitude() -> None:
         decode_frame(b"1234", RANGE_M)
 
 
-def test_replay_streams_it(path: Path) -> None:
-    record(path)
-    device = Replay(path, start=1)
-    for _ in range(2):
-        frames = list(device)
-        assert [frame.index for frame in frames] == [1, 2, 3]
-    assert frames[0].radial
-    np.testing.assert_array_equal(
-        frames[0].amplitude.ravel()[:3], np.frombuffer(raw_frames()[1], "<u2")[WIDTH * HEIGHT :][:3]
-    )
-    assert device.camera.K[0, 0] == 210
-
-
 def test_a_long_recording_needs_no_more_memory_than_a_short_one(path: Path) -> None:
     count, nonzero = 1000, raw_frames(1)[0]
     record(path)
@@ -192,37 +179,21 @@ def test_broken_files_are_reported(path: Path, content: bytes, words: str) -> No
     with pytest.raises(ToftrackError, match=words) as caught:
         read_srs(path)
     assert path.name in str(caught.value)
-    for other, reported in ((path.with_name("nope.srs"), "no file"), (path.parent, "directory")):
-        with pytest.raises(ToftrackError, match=reported):
-            read_srs(other)
 
 
-@pytest.mark.parametrize("kind", ["srs", "npz"])
-def test_random_corruption_is_reported_or_harmless(tmp_path: Path, kind: str) -> None:
-    path = tmp_path / f"recording.{kind}"
-    if kind == "srs":
-        record(path, 2)
-    else:
-        depth = np.random.default_rng(0).uniform(0.3, 2, (3, 12, 16)).astype(np.float32)
-        np.savez_compressed(path, depth_m=depth, K=np.diag((20.0, 20, 1)), metadata="{}")
+def test_random_corruption_is_reported_and_takes_no_memory(path: Path) -> None:
+    record(path, 2)
     whole, rng = path.read_bytes(), np.random.default_rng(2)
-    header = 500 if kind == "srs" else len(whole)  # mostly where it hurts
     tracemalloc.start()
     for number in range(300):
         data = bytearray(whole)
-        for _ in range(rng.integers(1, 4)):
-            data[rng.integers(header if number % 4 else len(data))] = rng.integers(256)
+        for _ in range(rng.integers(1, 4)):  # mostly where it hurts
+            data[rng.integers(500 if number % 4 else len(data))] = rng.integers(256)
         if number % 5 == 0:
             del data[rng.integers(len(data)) :]
         path.write_bytes(data)
         try:
-            if kind == "srs":
-                recording = read_srs(path)
-                for index in range(len(recording)):
-                    recording.image(index)
-                recording.close()
-            else:
-                read_recording(path)
+            read_srs(path).close()
         except ToftrackError as error:
             assert "\n" not in str(error)
     _, peak = tracemalloc.get_traced_memory()

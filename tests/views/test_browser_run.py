@@ -31,8 +31,7 @@ from helpers.programs import QUICK, interrupted_when
 from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
-from toftrack.devices.replay import Replay
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Replay, Sample
 from toftrack.estimate import no_estimate
 from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser

@@ -20,7 +20,7 @@ from helpers.programs import interrupted_when
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import read_labels
 from toftrack.evaluation.labelling import LABELLED, LabelFile, LabelFrame

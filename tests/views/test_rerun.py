@@ -22,7 +22,7 @@ from hydra.utils import instantiate
 
 import toftrack.views.rerun
 from toftrack.configuration.sentences import sentence
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify

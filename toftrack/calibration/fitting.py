@@ -20,7 +20,7 @@ from numpy.polynomial import Polynomial
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 
-ORDERS = tuple(range(1, 8))
+_ORDERS = range(1, 8)
 # Enlargements, tried in turn: the finder wants squares of more than a few pixels, and puts corners
 # least off at 5 (the focal length by 0.1 %, at 3 by 0.2 %).
 _SCALES = (5, 3, 7)
@@ -30,31 +30,33 @@ _FEWEST_VIEWS = 5
 _FOLDS = 5
 _STEP_M = 0.1  # of true distance, within which pixels are averaged
 _OUTLIER = 3.0  # times the median reprojection error
+_UNDETERMINED = (
+    "the corners do not determine the camera; show the board turned in all directions, near and far"
+)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A frame in which the board was found."""
+    """A frame in which the board was found: its index, and the corners, (columns * rows, 2) pixels
+    of the image as measured, row by row.
+    """
 
     index: int
     corners_px: np.ndarray
-    """(columns * rows, 2) pixels of the image as measured, row by row."""
 
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """What the corners say."""
+    """What the corners say: the camera, without a depth polynomial; the V views in use; in each of
+    them the board's (V, 3, 3) rotation and its first corner's (V, 3) place in the camera's frame;
+    and the (V,) rms distance between found and projected corners.
+    """
 
     camera: Camera
-    """Without a depth polynomial."""
     views: tuple[View, ...]
-    """Those in use."""
     rotations: np.ndarray
-    """(V, 3, 3) of the board in the camera's frame."""
     translations_m: np.ndarray
-    """(V, 3) of the board's first corner."""
     errors_px: np.ndarray
-    """(V,) rms distance between found and projected corners."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,14 +128,11 @@ def _enlarged(amplitude: np.ndarray, scale: float) -> np.ndarray | None:
 
 
 def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, guess: Camera) -> Lens:
-    """Intrinsics and lens distortion (k1, k2) from corners; views that do not fit are left out.
+    """Intrinsics and lens distortion (k1, k2) from corners of at least five views from different
+    sides; views that do not fit are left out.
 
-    views: at least five, from different sides.
-    board: columns, rows of inner corners.
-    square_m: side of a square.
-    guess: where to start, and the image's size.
-
-    Raises ToftrackError: there are too few views, or they do not determine the camera.
+    board: columns, rows of inner corners.  square_m: side of a square.  guess: where to start, and
+    the image's size. ToftrackError: there are too few views, or they do not determine the camera.
     """
     views, points = _enough(views, board), board_points(board, square_m)
     # Coefficients of another model (rational, fisheye) mean something else, and are no start.
@@ -151,10 +150,7 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
                 flags=flags,
             )
         except cv2.error as error:
-            raise ToftrackError(
-                "the corners do not determine the camera; show the board turned in all directions, "
-                "near and far"
-            ) from error
+            raise ToftrackError(_UNDETERMINED) from error
         errors = errors.ravel()
         good = errors <= max(_OUTLIER * float(np.median(errors)), 0.05)
         if good.all() or good.sum() < _FEWEST_VIEWS:
@@ -162,7 +158,7 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
         views = [view for view, keep in zip(views, good, strict=True) if keep]
     K[0, 1] = 0.0
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
-        raise ToftrackError("the corners do not determine the camera; show the board turned more")
+        raise ToftrackError(_UNDETERMINED)
     camera = Camera(K, guess.width, guess.height, distortion.ravel()[:5])
     return _lens(camera, views, rvecs, tvecs, errors)
 
@@ -221,14 +217,10 @@ def depth_pairs(
     square_m: float,
     images: Sequence[tuple[np.ndarray, np.ndarray]],
 ) -> DepthPairs:
-    """Measured against true distances on the boards.
+    """Measured against true distances on the boards of a lens's V views; board, square_m as above.
 
-    lens: with V views.
-    board: columns, rows of inner corners.
-    square_m: side of a square.
-    images: for each view the (H, W) radial distance in metres and the amplitude.
-
-    Raises ToftrackError: no pixel on any board has a reading.
+    images: for each view the (H, W) radial distance in metres and the amplitude. ToftrackError: no
+    pixel on any board has a reading.
     """
     measured, true, weight, view = [], [], [], []
     for number, (radial, amplitude) in enumerate(images):
@@ -265,10 +257,9 @@ def pixel_errors(pairs: DepthPairs, polynomial: tuple[float, ...] = ()) -> np.nd
     return pairs.measured_m + correction - pairs.true_m
 
 
-def fit_depth(pairs: DepthPairs, orders: Sequence[int] = ORDERS) -> DepthFit:
-    """The polynomial whose order predicts left-out frames best, by weighted least squares.
-
-    Raises ToftrackError: the boards are all at about one distance.
+def fit_depth(pairs: DepthPairs) -> DepthFit:
+    """The polynomial whose order predicts left-out frames best, by weighted least squares;
+    ToftrackError where the boards are all at about one distance.
     """
     pairs = _averaged(pairs)
     used = np.unique(pairs.view)
@@ -280,14 +271,12 @@ def fit_depth(pairs: DepthPairs, orders: Sequence[int] = ORDERS) -> DepthFit:
         )
     fold = np.searchsorted(used, pairs.view) % _FOLDS
     validation = {}
-    for order in orders:
+    for order in _ORDERS:
         square, total = 0.0, 0.0
         for number in range(_FOLDS):
             out = fold == number
             coefficients = _fit(pairs, ~out, order, near, far)
-            left_out = DepthPairs(
-                pairs.measured_m[out], pairs.true_m[out], pairs.weight[out], pairs.view[out]
-            )
+            left_out = DepthPairs(*(array[out] for array in vars(pairs).values()))
             _, error = frame_errors(left_out, coefficients)
             square += float((error**2).sum())
             total += len(error)

@@ -1,1 +1,1 @@
-"""Sources of frames behind one small protocol, `toftrack.devices.base.Device`."""
+"""Sources of frames, all of them a `toftrack.devices.base.BaseDevice`."""

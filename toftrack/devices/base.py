@@ -3,55 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Protocol, Self, runtime_checkable
+from typing import Any, Self
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import Frame, Truth
 
 
-@runtime_checkable
-class Device(Protocol):
+class BaseDevice:
     """A source of frames: open it (or use `with`), iterate over it, close it.
 
-    `open` and the iteration raise ToftrackError when the device cannot deliver.
-    """
-
-    camera: Camera
-    fps: float
-    frames: int | None
-    """How many frames an iteration yields at most; None for a live camera."""
-    truth: Truth | None
-    """One row for each of `frames`."""
-    description: dict[str, Any]
-    """Facts for the result's metadata, JSON-able."""
-    metadata: dict[str, Any]
-    """What the recording says about itself."""
-    live: bool
-    """Frames do not wait: the newest is delivered, and what comes too late is dropped."""
-    dropped: int
-    """Frames of the latest iteration that nobody was there to take; 0 unless `live`."""
-
-    def open(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def __enter__(self) -> Self: ...
-
-    def __exit__(self, *exception: object) -> None: ...
-
-    def __iter__(self) -> Iterator[Frame]: ...
-
-
-class BaseDevice:
-    """A `Device` but for its frames: derive from it, write `__iter__`, and `open` where needed.
-
-    Args:
-        camera: of the images.
-        fps: frames a second; what the overlay video plays at.
-        frames: how many an iteration yields at most; None = nobody knows.
-        truth: one row for each of `frames`.
-        live: frames do not wait, and what comes too late is dropped and counted in `dropped`.
+    Derive from it, write `__iter__`, and `open` and `close` where needed; `open` and the iteration
+    raise ToftrackError when the device cannot deliver.
     """
 
     def __init__(
@@ -62,16 +25,23 @@ class BaseDevice:
         truth: Truth | None = None,
         live: bool = False,
     ) -> None:
-        self.camera, self.fps, self.frames, self.truth = camera, float(fps), frames, truth
+        self.camera, self.fps = camera, float(fps)
+        """Of the images; what the overlay video plays at."""
+        self.frames, self.truth = frames, truth
+        """How many frames an iteration yields at most (None for a live camera); a row for each."""
         self.live, self.dropped = live, 0
+        """Frames do not wait: the newest is delivered, and what comes too late is dropped; frames
+        of the latest iteration that nobody was there to take, 0 unless `live`."""
         self.description: dict[str, Any] = {"device": type(self).__name__}
+        """Facts for the result's metadata, JSON-able."""
         self.metadata: dict[str, Any] = {}
+        """What the recording says about itself."""
 
     def open(self) -> None:
-        """Nothing to open."""
+        """Nothing by default."""
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Nothing by default."""
 
     def __enter__(self) -> Self:
         self.open()
@@ -83,3 +53,7 @@ class BaseDevice:
     def __iter__(self) -> Iterator[Frame]:
         """The frames, in order; raises ToftrackError when the device cannot deliver."""
         raise ToftrackError(f"{type(self).__name__} has no frames; write its method __iter__")
+
+
+Device = BaseDevice
+"""What whoever takes one calls it."""

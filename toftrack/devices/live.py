@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import Frame
 
 _log = logging.getLogger(__name__)
@@ -28,18 +28,13 @@ _LONGEST_GAP_S = 60  # results have a row for each index, so that a wild number 
 class FrameNumbers:
     """A camera's frame numbers as indices from 0; what was dropped leaves a gap.
 
-    A camera that counts anew goes on with the next index.
-
-    Args:
-        fps: of the camera.
-        first: number of its first frame; None = that of the first one that comes.
+    A camera that counts anew goes on with the next index.  first: number of its first frame; None =
+    that of the first one that comes.
     """
 
     def __init__(self, fps: float, first: int | None = None) -> None:
-        self.index = -1
-        """Of the latest frame."""
-        self.dropped = 0
-        """Frames that came between two."""
+        self.index, self.dropped = -1, 0
+        """Of the latest frame; frames that came between two."""
         self._offset, self._most = first, _LONGEST_GAP_S * fps
 
     def take(self, number: int) -> int:
@@ -55,10 +50,8 @@ def chosen_serial(
     numbers: Sequence[str], serial: str | int | None, maker: str, otherwise: str = ""
 ) -> str:
     """The serial number of the camera that is meant, of those plugged in; None: the only one.
-
-    otherwise: what else a user without a camera may do.
-
-    Raises ToftrackError where there is none of it, or several and none is chosen.
+    ToftrackError where there is none of it (`otherwise`: what else a user may do), or several and
+    none is chosen.
     """
     listed = ", ".join(sorted(numbers))
     if not numbers:
@@ -84,11 +77,8 @@ Size = tuple[int | None, int | None, int | None]
 
 
 def chosen_profile(offered: Sequence[T], size_of: Callable[[T], Size], size: Size, owner: str) -> T:
-    """The first profile of that size, of those of depth images that a camera offers.
-
-    owner: what errors call the camera.
-
-    Raises ToftrackError where it has no depth images, or none of that size.
+    """The first profile of that size, of those of depth images that a camera (`owner`) offers.
+    ToftrackError where it has no depth images, or none of that size.
     """
     if not offered:
         raise ToftrackError(f"{owner} has no depth images; use a camera with a depth sensor")
@@ -115,8 +105,13 @@ class SdkCamera(BaseDevice):
     kind: str
     """Of the configuration."""
     maker: str
+    errors: tuple[type[Exception], ...] = (RuntimeError,)
+    """What the SDK raises."""
     first_number: int | None = None
     """Of the first frame; None = whatever comes first."""
+    _pipeline: Any
+    """Of the SDK; `stop` ends it."""
+    _running = False
 
     def _begin(
         self,
@@ -128,7 +123,19 @@ class SdkCamera(BaseDevice):
         timeout_s: float,
     ) -> None:
         """Check the settings that all such cameras have; raises ToftrackError."""
-        check_live(self.kind, keep, queue_frames, start, stop, timeout_s)
+        numbers = isinstance(queue_frames, int) and isinstance(timeout_s, int | float)
+        sensible = numbers and queue_frames >= 2 and timeout_s > 0
+        if keep not in ("newest", "every") or not sensible:
+            raise ToftrackError(
+                f"device={self.kind} needs keep=newest or every, queue_frames of at least 2 and "
+                f"timeout_s above 0, but they are {keep}, {queue_frames!r} and {timeout_s!r}"
+            )
+        whole = all(isinstance(number, int) for number in (start, stop) if number is not None)
+        if not whole or start < 0 or (stop is not None and stop <= start):
+            raise ToftrackError(
+                f"device={self.kind} needs whole numbers 0 <= start < stop, but they are "
+                f"{start!r} and {stop!r}"
+            )
         self._path = None if bag is None else Path(bag).expanduser()
         if self._path is not None and not self._path.is_file():
             raise ToftrackError(f"there is no file '{bag}'; give a recording with device.bag=FILE")
@@ -155,6 +162,31 @@ class SdkCamera(BaseDevice):
             self.frames = self._stop - self._start
         more = {"fps": self.fps, "camera_file": None if camera_file is None else str(camera_file)}
         self.description = {"device": self.kind, "size": list(size), **self._about, **about, **more}
+
+    def open(self) -> None:
+        """Start the camera, or the recording; ToftrackError when it cannot be."""
+        if self._running:
+            return
+        what = f"the {self.maker} camera was found, but cannot be started"
+        if self._path is not None:
+            what = f"'{self._path}' cannot be replayed"
+        with reported_errors(what, self._remedy, *self.errors):
+            self._run()
+        self._running = True
+
+    def close(self) -> None:
+        """Stop the camera; a second call does nothing."""
+        if not self._running:
+            return
+        self._running = False
+        try:
+            self._pipeline.stop()
+        except self.errors as error:  # of a camera that is gone
+            _log.warning("%s: %s", self.kind, error)
+
+    @abstractmethod
+    def _run(self) -> None:
+        """Start the SDK's pipeline."""
 
     @abstractmethod
     def _take(self) -> Any | None:
@@ -228,22 +260,3 @@ class SdkCamera(BaseDevice):
                     "unplug it and plug it in again, into a USB 3 port, or lower device.width, "
                     "device.height and device.fps"
                 )
-
-
-def check_live(
-    device: str, keep: str, queue_frames: int, start: int, stop: int | None, timeout_s: float
-) -> None:
-    """Raise ToftrackError where the settings that live cameras share make no sense."""
-    numbers = isinstance(queue_frames, int) and isinstance(timeout_s, int | float)
-    sensible = numbers and queue_frames >= 2 and timeout_s > 0
-    if keep not in ("newest", "every") or not sensible:
-        raise ToftrackError(
-            f"device={device} needs keep=newest or every, queue_frames of at least 2 and timeout_s "
-            f"above 0, but they are {keep}, {queue_frames!r} and {timeout_s!r}"
-        )
-    whole = all(isinstance(number, int) for number in (start, stop) if number is not None)
-    if not whole or start < 0 or (stop is not None and stop <= start):
-        raise ToftrackError(
-            f"device={device} needs whole numbers 0 <= start < stop, but they are "
-            f"{start!r} and {stop!r}"
-        )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
 import math
 import time
@@ -22,7 +21,12 @@ from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.store import open_recording
+from toftrack.recordings.store import (
+    FIRST_SAMPLE,
+    open_recording,
+    packaged_sample,
+    sample_file,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -37,21 +41,11 @@ class Replay(BaseDevice):
     A `.npz` is loaded; everything else is read frame by frame, so that long ones need no more
     memory than short ones.
 
-    Args:
-        path: the recording, of any kind that `open_recording` knows.
-        start: first frame.
-        stop: the frame after the last; None for all.
-        realtime: at the recording's own pace: wait for each frame's time, and drop a frame when the
-            next one is already due (the last is always delivered). Otherwise every frame, as fast
-            as it is asked for.
-        repeat: begin again after the last frame, until nobody asks for more.
-        camera_file: a calibrated camera instead of the recording's own.
-        modulation_mhz: of the SR3000, for a `.srs` that does not state its range.
-        intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the recording's camera.
-        store: the recording, where it is open already.
-
-    Raises:
-        ToftrackError: the recording or the camera cannot be used, or the range lies outside.
+    path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, and drop a
+    frame when the next one is already due (the last is always delivered); otherwise every frame, as
+    fast as it is asked for.  camera_file, intrinsics (fx, fy, cx, cy in pixels): instead of the
+    recording's own camera.  store: the recording, where it is open already. Raises ToftrackError:
+    the recording or the camera cannot be used, or the range lies outside.
     """
 
     def __init__(
@@ -74,18 +68,17 @@ class Replay(BaseDevice):
         self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
-        self._range = _checked_range(start, stop, len(self._recording), path)
+        self._range = _checked_range(start, stop, len(store), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
-        camera = store.camera
-        given = BareFacts(intrinsics).camera(camera.width, camera.height)
-        if given is not None and camera_file is not None:
+        if intrinsics is not None and camera_file is not None:
             raise ToftrackError(
                 "camera.file and device.intrinsics both tell the lens; leave one out"
             )
-        if given is not None:
+        camera, size = store.camera, (store.camera.width, store.camera.height)
+        if camera_file is not None:
+            camera = Camera.load_for(camera_file, *size, f"'{path}'")
+        elif given := BareFacts(intrinsics).camera(*size):
             camera = given
-        elif camera_file is not None:
-            camera = Camera.load_for(camera_file, camera.width, camera.height, f"'{path}'")
         found = doubts(store, camera)
         for doubt in found:
             _log.warning("%s: %s", path, doubt)
@@ -110,34 +103,28 @@ class Replay(BaseDevice):
         }
 
     def close(self) -> None:
-        """Close the recording's file, if it is open."""
         self._recording.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        self.dropped = 0
-        counts = self._paced() if self._realtime else self._all()
+        self.dropped, begin = 0, time.monotonic()
+        count, last = 0, math.inf if self._repeat else len(self._range) - 1
         try:
-            for count in counts:
+            while count <= last:
+                if self._realtime:
+                    count = self._paced(count, last, time.monotonic() - begin)
                 yield self._frame(count)
+                count += 1
         finally:
             self._recording.close()
 
-    def _all(self) -> Iterator[int]:
-        return itertools.count() if self._repeat else iter(range(len(self._range)))
-
-    def _paced(self) -> Iterator[int]:
-        begin = time.monotonic()
-        count, last = 0, math.inf if self._repeat else len(self._range) - 1
-        while count <= last:
-            now = time.monotonic() - begin
-            newest = int(min(self._due(now), last))
-            if newest > count:
-                self.dropped += newest - count
-                count = newest
-            elif (early_s := self._time_s(count) - self._time_s(0) - now) > 0:
-                time.sleep(early_s)
-            yield count
-            count += 1
+    def _paced(self, count: int, last: float, elapsed_s: float) -> int:
+        """The count of the frame whose turn it is, when it is due; `dropped` are left out."""
+        newest = int(min(self._due(elapsed_s), last))
+        if newest > count:
+            self.dropped += newest - count
+            return newest
+        time.sleep(max(0.0, self._time_s(count) - self._time_s(0) - elapsed_s))
+        return count
 
     def _due(self, elapsed_s: float) -> int:
         """The count of the newest frame that is due so long after the first one."""
@@ -171,18 +158,7 @@ class Replay(BaseDevice):
 
 
 class Folder(Replay):
-    """The images of a folder, as `Replay`; what the folder does not state can be given.
-
-    Args:
-        path: the folder; see `toftrack.recordings.png_folder` for what lies in it.
-        unit_m: metres of one step of the images; None = as the folder says, else 0.001.
-        fps: frames a second; None = as the folder says, else 25.
-        intrinsics: fx, fy, cx, cy in pixels, without distortion, instead of the folder's camera.
-        camera_file, start, stop, realtime, repeat: as for `Replay`.
-
-    Raises:
-        ToftrackError: as `Replay`, and when the images are not 16-bit grey PNGs of one size.
-    """
+    """The images of a folder, as `Replay`; what the folder does not state can be given."""
 
     def __init__(
         self,
@@ -202,17 +178,7 @@ class Folder(Replay):
 
 
 class Bag(Replay):
-    """The depth images of one topic of a bag, as `Replay`.
-
-    Args:
-        path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.
-        topic: of the depth images; None = the only one there is.
-        unit_m: metres of one step of 16UC1; None = a millimetre, as ROS says.
-        camera_file, start, stop, realtime, repeat: as for `Replay`.
-
-    Raises:
-        ToftrackError: as `Replay`, and as `read_rosbag`.
-    """
+    """The depth images of one topic of a bag, as `Replay` and `read_rosbag`."""
 
     def __init__(
         self,
@@ -227,6 +193,19 @@ class Bag(Replay):
         store = read_rosbag(path, topic, camera_file, unit_m)
         super().__init__(path, camera_file=camera_file, store=store, **playback)
         self.description |= {"device": "rosbag", **store.metadata, "unit_m": store.unit_m}
+
+
+class Sample(Replay):
+    """A recording that comes with the package, with ground truth; as `Replay`. ToftrackError, which
+    lists them, for a name that no sample has.
+    """
+
+    def __init__(self, name: str = FIRST_SAMPLE, **playback: Any) -> None:
+        with packaged_sample(name) as path:
+            super().__init__(path, **playback)
+        # Where the package happens to be installed says nothing about the result.
+        recording = f"toftrack/data/{sample_file(name)}"
+        self.description |= {"device": "sample", "name": name, "recording": recording}
 
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:

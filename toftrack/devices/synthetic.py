@@ -31,16 +31,8 @@ _AMPLITUDE_AT_1M = 700.0
 class Synthetic(BaseDevice):
     """A right hand that closes to a fist and opens again while it drifts and turns.
 
-    Args:
-        frames: how many.
-        fps: frames per second.
-        noise_m: standard deviation of the depth at 0.5 m; it grows with the square of the distance,
-            as a Time-of-Flight camera's does while its amplitude falls.
-        seed: of the noise.
-        camera_file: another camera than the SR3000's nominal one (176 x 144, 200 px).
-
-    Raises:
-        ToftrackError: no frames, or negative noise.
+    The arguments are those of conf/device/synthetic.yaml. The noise grows with the square of the
+    distance, as a Time-of-Flight camera's does while its amplitude falls.
     """
 
     def __init__(

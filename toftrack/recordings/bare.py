@@ -13,20 +13,17 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import LARGEST_MEDIAN_M, median_reading
-from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore
-from toftrack.safe_files import check_readable
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 
 MILLIMETRE = 0.001
 _BESIDE = "camera.json"
+_BROKEN = (ValueError, EOFError, TypeError, SyntaxError, OverflowError, tokenize.TokenError)
+"""What numpy raises of a damaged `.npy`."""
 
 
 @dataclass(frozen=True)
 class BareFacts:
-    """None = not given.
-
-    Raises ToftrackError for a unit or a rate that is not positive, and for intrinsics that are not
-    four numbers, the first two of them positive.
-    """
+    """None = not given; ToftrackError for what cannot be meant."""
 
     intrinsics: Sequence[float] | None = None
     """fx, fy, cx, cy in pixels, without distortion."""
@@ -71,9 +68,8 @@ NOTHING_GIVEN = BareFacts()
 def bare_camera(
     path: Path, camera_file: str | Path | None, bare: BareFacts, width: int, height: int
 ) -> Camera:
-    """The camera of a file of bare images of that size: as given, else camera.json beside it.
-
-    Raises ToftrackError where there is none, or it is of another size.
+    """The camera of a file of bare images of that size: as given, else camera.json beside it;
+    ToftrackError where there is none, or it is of another size.
     """
     if camera_file is not None:
         return Camera.load_for(camera_file, width, height, f"'{path}'")
@@ -96,8 +92,8 @@ class NpyStack(FrameStore):
     def __init__(self, images: np.ndarray, camera: Camera, bare: BareFacts) -> None:
         whole = images.dtype.kind in "ui"
         self.camera, self.metadata = camera, {}
-        self.unit_m = (MILLIMETRE if whole else 1.0) if bare.unit_m is None else bare.unit_m
-        self.fps = DEFAULT_FPS if bare.fps is None else bare.fps
+        self.unit_m = bare.unit_m or (MILLIMETRE if whole else 1.0)
+        self.fps = bare.fps or DEFAULT_FPS
         self.timestamp_s = np.arange(len(images)) / self.fps
         self._images = images
 
@@ -110,14 +106,20 @@ class NpyStack(FrameStore):
 def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> NpyStack:
     """Open a stack.
 
-    path: the `.npy`.
-    camera_file: of the camera; None = the given intrinsics, or camera.json beside the file.
-    bare: intrinsics, unit of whole numbers (a millimetre) and frame rate (25) where given.
-
-    Raises ToftrackError: it is no such stack, holds pickled objects, or nothing tells its camera.
+    camera_file: None = the given intrinsics, or camera.json beside the file.  bare: intrinsics,
+    unit of whole numbers (a millimetre) and frame rate (25) where given. Raises ToftrackError: it
+    is no such stack, holds pickled objects, or nothing tells its camera.
     """
-    path = Path(path).expanduser()
-    images = _mapped(path)
+    path = file_of(path)
+    try:
+        with reading(path):
+            images = np.load(path, mmap_mode="r", allow_pickle=False)
+    except _BROKEN as error:
+        reason = " ".join(str(error).split())
+        raise ToftrackError(
+            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
+            "numpy.save"
+        ) from error
     if images.ndim == 2:
         images = images[None]
     if images.ndim != 3 or images.size == 0 or images.dtype.kind not in "uif":
@@ -140,26 +142,3 @@ def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:
         raise ToftrackError(
             f"the median of {what} is {median:.0f} m, which is plainly another unit{remedy}"
         )
-
-
-def _mapped(path: Path) -> np.ndarray:
-    try:
-        check_readable(path)
-        return np.load(path, mmap_mode="r", allow_pickle=False)
-    except FileNotFoundError:
-        raise ToftrackError(f"there is no file '{path}'; give the path of a recording") from None
-    except OSError as error:
-        raise ToftrackError(f"'{path}' cannot be read ({error.strerror or error})") from error
-    except (
-        ValueError,
-        EOFError,
-        TypeError,
-        SyntaxError,
-        OverflowError,
-        tokenize.TokenError,
-    ) as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
-            "numpy.save"
-        ) from error

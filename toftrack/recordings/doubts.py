@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
@@ -16,14 +15,8 @@ from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.frames import median_reading, nearest_reading
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npz_pieces import Images, StreamedImages
+from toftrack.recordings.npz import some_images
 
-_PER_FRAME = (
-    *("timestamp_s", "joints_m", "visible", "in_space"),
-    *("visible_fraction", "joint_visible"),
-)
-_IN_THE_MIDDLE, _ASIDE = 0.12, 0.15
-"""How far from the image's middle the centre of K lies, in shares of its sides."""
 _NO_CAMERA_M, _NO_SCENE_M, _NO_HAND_M = 0.1, 0.3, 4.0
 """No camera sees what is nearer, no hand's background is so near, no hand is tracked so far."""
 _NEAREST_M = (0.15, 1.5)
@@ -40,23 +33,6 @@ _TIME_UNITS = (
 _KEPT, _LEFT_BY_RIGHT_ONE = 0.7, 0.85
 """Share of the image that is left when a lens is undone: one that leaves less is doubted; one that
 may have been meant leaves more than the other."""
-
-
-def check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> None:
-    """ToftrackError where the images' middle and K say that the frames are counted last."""
-    last = shape[2]
-    lengths = {len(arrays[name]) for name in _PER_FRAME if name in arrays and arrays[name].ndim}
-    centre = np.asarray(arrays["K"])[:2, 2] if np.shape(arrays["K"]) == (3, 3) else None
-    if centre is None or centre.dtype.kind not in "iuf" or shape[0] in lengths:
-        return
-    aside, aside_if_last = (
-        np.abs(centre / (width, height) - 0.5).max() for height, width in (shape[1:], shape[:2])
-    )
-    if last in lengths or (aside_if_last < _IN_THE_MIDDLE and aside > _ASIDE):
-        raise ToftrackError(
-            f"'{key}' has the shape {shape}, which by K and the other keys is (rows, columns, "
-            f"frames), but must be (frames, rows, columns); save numpy.moveaxis({key}, -1, 0)"
-        )
 
 
 def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
@@ -174,10 +150,3 @@ def _other_lenses(camera: Camera) -> Iterator[tuple[str, Camera]]:
         )
     yield "the opposite signs", replace(camera, distortion=-given)
     yield "zeros", replace(camera, distortion=np.zeros(5), lens="opencv")
-
-
-def some_images(depth: Images) -> np.ndarray:
-    """(n, H, W) of it, to judge the whole by: all of a long one would only take longer."""
-    if isinstance(depth, StreamedImages):
-        return np.stack([depth[index] for index in range(min(4, len(depth)))])
-    return depth[np.unique(np.linspace(0, len(depth) - 1, 16).astype(int))]

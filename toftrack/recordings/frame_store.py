@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from contextlib import AbstractContextManager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from toftrack.camera import Camera
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import Truth
+from toftrack.safe_files import check_readable
 
 DEFAULT_FPS = 25.0
 
@@ -35,13 +39,31 @@ class FrameStore:
     @abstractmethod
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """Depth, (H, W) float32 metres, 0 = no reading, a new array, and amplitude, (H, W) uint16
-        or None.
-
-        Raises ToftrackError when it cannot be read, is damaged, or of another size.
+        or None. Raises ToftrackError when it cannot be read, is damaged, or of another size.
         """
 
     def close(self) -> None:
         """Close the file, if one is open; it opens again by itself."""
+
+
+def file_of(path: str | Path, suffix: str = "") -> Path:
+    """The path of a recording that is one file; ToftrackError where there is no file, or none to be
+    opened.
+    """
+    path, give = Path(path).expanduser(), f"give the path of a recording{suffix}"
+    if path.is_dir():
+        raise ToftrackError(f"'{path}' is a directory; {give}")
+    if not path.exists():
+        raise ToftrackError(f"there is no file '{path}'; {give}")
+    with reading(path):
+        check_readable(path)
+    return path
+
+
+def reading(path: Path) -> AbstractContextManager[None]:
+    """What the system says of a recording becomes one sentence."""
+    what = f"the recording '{path}' cannot be read"
+    return reported_errors(what, "check the file and its permissions")
 
 
 def rate_of(timestamp_s: np.ndarray, otherwise: float = DEFAULT_FPS) -> float:

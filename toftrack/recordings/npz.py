@@ -23,28 +23,101 @@ Unknown keys are ignored.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from toftrack.archives import MOST_BYTES, Archive, PickledError, Pieces, write_archive
+from toftrack.archives import MOST_BYTES, Archive, Header, PickledError, Pieces, write_archive
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Truth, median_reading, wrong_unit
 from toftrack.json_text import parse_json
-from toftrack.recordings.doubts import check_layout, some_images
-from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, rate_of
-from toftrack.recordings.npz_pieces import Images, StreamedImages
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 from toftrack.safe_files import open_to_read
 
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""
 _IMAGES = ("depth_m", "radial_m", "amplitude")
-CAMERA_KEYS = ("K", "distortion", "lens", "depth_polynomial", "depth_polynomial_range_m")
-_POLYNOMIAL = CAMERA_KEYS[3:]
+_POLYNOMIAL = ("depth_polynomial", "depth_polynomial_range_m")
+_CAMERA = ("K", "distortion", "lens", *_POLYNOMIAL)
+_TRUTH: dict[str, tuple[type, tuple[int, ...]]] = {
+    "joints_m": (np.float32, (21, 3)),
+    "visible": (bool, ()),
+    "in_space": (bool, ()),
+    "visible_fraction": (np.float32, ()),
+    "joint_visible": (bool, (21,)),
+    "pose_name": (str, ()),
+}
+"""Fields of `Truth`, which are keys of a file: their type, and the shape of one frame's."""
+_OTHER = {name: f"{name}2" for name in _TRUTH} | {"joints_m": "joints2_m"}
+"""The keys of the other hand's."""
+_KEYS = (*_IMAGES, *_CAMERA, "fps", "timestamp_s", *_TRUTH, *_OTHER.values(), "metadata")
+_IN_THE_MIDDLE, _ASIDE = 0.12, 0.15
+"""How far from the image's middle the centre of K lies, in shares of its sides."""
+
+
+class StreamedImages:
+    """(T, H, W) images of one array of an archive, each to be had by its number.
+
+    Made for going forward: an image before the latest one is found by beginning anew.
+    ToftrackError where the array cannot be read in turn, and later where it is damaged.
+    """
+
+    def __init__(self, path: Path, name: str, header: Header) -> None:
+        self._path, self._name = path, name
+        if header.fortran_order or header.kind.kind not in "fiu":
+            raise ToftrackError(
+                f"'{name}' of the recording '{path}' has {header.size / 1e9:.1f} GB, and can be "
+                "read in turn only as numbers in C order; save it so (numpy.ascontiguousarray)"
+            )
+        self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
+        self.size = int(np.prod(header.shape, dtype=object))
+        self._images: Generator[np.ndarray] | None = None
+        self._latest: tuple[int, np.ndarray] | None = None
+
+    def __len__(self) -> int:
+        return self.shape[0]
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        if not 0 <= index < len(self):
+            raise IndexError(index)
+        if self._latest is None or index < self._latest[0]:
+            self.close()
+            self._images = self._in_turn()
+        number, image = self._latest or (-1, np.empty(0))
+        while number < index:
+            assert self._images is not None
+            number, image = number + 1, next(self._images)
+            self._latest = number, image
+        return image
+
+    def close(self) -> None:
+        if self._images is not None:
+            self._images.close()
+        self._images = self._latest = None
+
+    def _in_turn(self) -> Generator[np.ndarray]:
+        shape = self.shape[1:]
+        size = int(np.prod(shape)) * self.dtype.itemsize
+        recording, remedy = f"the recording '{self._path}'", "copy or record it again"
+        with (
+            reported_errors(f"{recording} cannot be read", remedy),
+            reported_errors(f"{recording} is damaged", remedy, ValueError),
+            open_to_read(self._path) as file,
+            Archive(file).rows(self._name) as stream,
+        ):
+            for _ in range(len(self)):
+                content = stream.read(size)
+                if len(content) < size:
+                    raise ValueError(f"{self._name!r} is cut off")
+                yield np.frombuffer(content, self.dtype).reshape(shape)
+
+
+Images = np.ndarray | StreamedImages
+"""(T, H, W) images, in memory or on the disk."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -73,13 +146,22 @@ class Recording(FrameStore):
 
 
 def read_recording(path: str | Path) -> Recording:
-    """Read and check a recording.
-
-    Raises ToftrackError, one sentence that names the file, when it is missing, damaged, contains
-    pickled objects or breaks the format above.
+    """Read and check a recording. ToftrackError, one sentence that names the file, when it is
+    missing, damaged, contains pickled objects or breaks the format above.
     """
-    path = Path(path).expanduser()
-    arrays = _read_members(path)
+    path = file_of(path, " (.npz)")
+    try:
+        with reading(path), open_to_read(path) as stream:
+            arrays = _read_archive(path, Archive(stream))
+    except PickledError as error:
+        raise ToftrackError(
+            f"the recording '{path}' is refused: {error}, and they can run code; save plain arrays "
+            "and text only"
+        ) from None
+    except ValueError as error:
+        raise ToftrackError(
+            f"the recording '{path}' is damaged ({error}); copy or record it again"
+        ) from error
     try:
         return _parse(arrays)
     except ToftrackError as error:
@@ -92,12 +174,9 @@ def write_recording(
     """Write any recording frame by frame, compressed; an existing file is replaced only by a
     complete one.
 
-    path: the file.
     store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
-        float32), and becomes float32 of others.
-    progress: called after each frame's depth.
-
-    Raises ToftrackError: the file cannot be written, or the store not be read.
+    float32), and becomes float32 of others.  progress: called after each frame's depth. Raises
+    ToftrackError: the file cannot be written, or the store not be read.
     """
 
     def depth_images() -> Iterator[np.ndarray]:
@@ -123,36 +202,9 @@ def write_recording(
     if store.image(0)[1] is not None:
         arrays["amplitude"] = Pieces(shape, np.dtype("<u2"), amplitude_images())
     if store.truth is not None:
-        arrays |= truth_arrays(store.truth)
+        arrays |= _truth_arrays(store.truth)
     with reported_errors(f"the recording '{path}' cannot be written", "choose another place"):
         write_archive(path, arrays)
-
-
-def _read_members(path: Path) -> dict[str, Images]:
-    """The known arrays of the archive; every way in which a file can be broken ends here."""
-    if path.is_dir():
-        raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.npz)")
-    try:
-        with open_to_read(path) as stream:
-            return _read_archive(path, Archive(stream))
-    except FileNotFoundError:
-        raise ToftrackError(
-            f"there is no file '{path}'; give the path of a recording (.npz)"
-        ) from None
-    except OSError as error:
-        raise ToftrackError(
-            f"the recording '{path}' cannot be read ({error.strerror or error}); check the file "
-            "and its permissions"
-        ) from error
-    except PickledError as error:
-        raise ToftrackError(
-            f"the recording '{path}' is refused: {error}, and they can run code; save plain arrays "
-            "and text only"
-        ) from None
-    except ValueError as error:
-        raise ToftrackError(
-            f"the recording '{path}' is damaged ({error}); copy or record it again"
-        ) from error
 
 
 def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
@@ -175,7 +227,7 @@ def _parse(arrays: dict[str, Any]) -> Recording:
     if "K" not in arrays:
         raise ToftrackError("the required key 'K' (3x3 camera matrix, pixels) is missing; add it")
     depth = _check_depth(arrays[depth_key], depth_key)
-    check_layout(depth.shape, arrays, depth_key)
+    _check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
     camera = _camera_of(arrays, width, height)
     timestamp_s, fps = _times(arrays, count)
@@ -187,9 +239,33 @@ def _parse(arrays: dict[str, Any]) -> Recording:
         timestamp_s=timestamp_s,
         fps=fps,
         amplitude=_amplitude(arrays, depth.shape),
-        truth=read_truth(arrays, count, metadata),
+        truth=_read_truth(arrays, count, metadata),
         metadata=metadata,
     )
+
+
+def some_images(depth: Images) -> np.ndarray:
+    """(n, H, W) of it, to judge the whole by: all of a long one would only take longer."""
+    if isinstance(depth, StreamedImages):
+        return np.stack([depth[index] for index in range(min(4, len(depth)))])
+    return depth[np.unique(np.linspace(0, len(depth) - 1, 16).astype(int))]
+
+
+def _check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> None:
+    """ToftrackError where the images' middle and K say that the frames are counted last."""
+    per_frame = ("timestamp_s", *_TRUTH)
+    lengths = {len(arrays[name]) for name in per_frame if name in arrays and arrays[name].ndim}
+    centre = np.asarray(arrays["K"])[:2, 2] if np.shape(arrays["K"]) == (3, 3) else None
+    if centre is None or centre.dtype.kind not in "iuf" or shape[0] in lengths:
+        return
+    aside, aside_if_last = (
+        np.abs(centre / (width, height) - 0.5).max() for height, width in (shape[1:], shape[:2])
+    )
+    if shape[2] in lengths or (aside_if_last < _IN_THE_MIDDLE and aside > _ASIDE):
+        raise ToftrackError(
+            f"'{key}' has the shape {shape}, which by K and the other keys is (rows, columns, "
+            f"frames), but must be (frames, rows, columns); save numpy.moveaxis({key}, -1, 0)"
+        )
 
 
 def _check_depth(depth: Images, key: str) -> Images:
@@ -209,12 +285,8 @@ def _check_depth(depth: Images, key: str) -> Images:
     median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
         raise wrong_unit(f"'{key}'", some, str(depth.dtype) if whole else "")
-    if isinstance(depth, StreamedImages) or depth.dtype.newbyteorder("=") in (
-        np.float16,
-        np.float32,
-    ):
-        return depth
-    return depth.astype(np.float32)
+    kept = depth.dtype.newbyteorder("=") in (np.float16, np.float32)
+    return depth if kept or isinstance(depth, StreamedImages) else depth.astype(np.float32)
 
 
 def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
@@ -228,7 +300,7 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
     if "timestamp_s" not in arrays:
         fps = DEFAULT_FPS if fps is None else fps
         return np.arange(count) / fps, fps
-    timestamp_s = of_shape(arrays, "timestamp_s", (count,)).astype(np.float64)
+    timestamp_s = _shaped(arrays, "timestamp_s", (count,)).astype(np.float64)
     if not np.isfinite(timestamp_s).all() or (np.diff(timestamp_s) < 0).any():
         raise ToftrackError("'timestamp_s' must be finite and must not go backwards")
     return timestamp_s, rate_of(timestamp_s, DEFAULT_FPS if fps is None else fps)
@@ -237,7 +309,7 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
 def _amplitude(arrays: dict[str, Any], shape: tuple[int, ...]) -> Images | None:
     if "amplitude" not in arrays:
         return None
-    amplitude = of_shape(arrays, "amplitude", shape)
+    amplitude = _shaped(arrays, "amplitude", shape)
     if amplitude.dtype.kind not in "iu":
         raise ToftrackError(f"'amplitude' must be uint16, but is {amplitude.dtype}")
     if amplitude.dtype == np.uint16:
@@ -289,43 +361,21 @@ def _camera_of(arrays: dict[str, Any], width: int, height: int) -> Camera:
     )
 
 
-_JOINTS = 21
-_FIELDS = ("joints_m", "visible", "in_space", "visible_fraction", "joint_visible", "pose_name")
-_FIRST = {name: name for name in _FIELDS}
-"""What fields of Truth are called in a file."""
-_OTHER = {name: f"{name}2" for name in _FIELDS} | {"joints_m": "joints2_m"}
-"""Those of the other hand."""
-_KEYS = (
-    "depth_m",
-    "radial_m",
-    *CAMERA_KEYS,
-    "amplitude",
-    "fps",
-    "timestamp_s",
-    *_FIRST.values(),
-    *_OTHER.values(),
-    "metadata",
-)
-
-
-def truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
+def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
     """The arrays of a file; sides and rests belong into its metadata."""
-    arrays: dict[str, np.ndarray] = {}
-    for keys, hand in ((_FIRST, truth), (_OTHER, truth.other)):
-        values = {key: getattr(hand, name, None) for name, key in keys.items()}
-        arrays |= {key: value for key, value in values.items() if value is not None}
-    return arrays
+    arrays = {name: getattr(truth, name) for name in _TRUTH}
+    if truth.other is not None:
+        arrays |= {key: getattr(truth.other, name) for name, key in _OTHER.items()}
+    return {key: value for key, value in arrays.items() if value is not None}
 
 
-def read_truth(arrays: dict[str, Any], count: int, metadata: dict[str, Any]) -> Truth | None:
+def _read_truth(arrays: dict[str, Any], count: int, metadata: dict[str, Any]) -> Truth | None:
     """The truth of `count` frames; None where a file has none.
 
     Sides and rests are read from the metadata where it has them: `side` (or `handedness`) and
     `side2`, and `still`, the first and the last frame of each rest of the first hand.
-
-    Raises ToftrackError, a sentence about a key, when an array cannot be meant.
     """
-    first = _truth_of_one(arrays, count, _FIRST)
+    first = _truth_of_one(arrays, count, {name: name for name in _TRUTH})
     if first is None:
         return None
     other = _truth_of_one(arrays, count, _OTHER)
@@ -335,54 +385,35 @@ def read_truth(arrays: dict[str, Any], count: int, metadata: dict[str, Any]) -> 
     return replace(first, other=other, side=side, still=_still(metadata.get("still"), count))
 
 
-def of_shape(arrays: dict[str, Any], key: str, shape: tuple[int, ...]) -> np.ndarray:
-    """A numeric or boolean array of the given shape."""
+def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> Truth | None:
+    """Of one hand.  keys: what the fields are called."""
+    if keys["joints_m"] not in arrays:
+        return None
+    found: dict[str, Any] = {"visible": np.ones(count, bool), "in_space": np.ones(count, bool)}
+    for name, (kind, shape) in _TRUTH.items():
+        if keys[name] in arrays:
+            array = _shaped(arrays, keys[name], (count, *shape), text=kind is str)
+            found[name] = array if kind is str else array.astype(kind)
+    if not np.isfinite(found["joints_m"]).all():
+        name = keys["joints_m"]
+        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
+    return Truth(**found)
+
+
+def _shaped(
+    arrays: dict[str, Any], key: str, shape: tuple[int, ...], text: bool = False
+) -> np.ndarray:
+    """An array of the given shape, of numbers and booleans, or of text."""
     array = arrays[key]
-    if array.dtype.kind not in "biuf":
-        raise ToftrackError(f"'{key}' must consist of numbers, but is {array.dtype}")
-    return _shaped(array, key, shape)
-
-
-def _shaped(array: np.ndarray, key: str, shape: tuple[int, ...]) -> np.ndarray:
+    if array.dtype.kind not in ("US" if text else "biuf"):
+        wanted = "be text" if text else "consist of numbers"
+        raise ToftrackError(f"'{key}' must {wanted}, but is {array.dtype}")
     if array.shape != shape:
         raise ToftrackError(
             f"'{key}' must have the shape {shape} (the first is the number of frames), but has "
             f"{array.shape}"
         )
-    return array
-
-
-def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> Truth | None:
-    """Of one hand.  keys: what the fields are called."""
-    if keys["joints_m"] not in arrays:
-        return None
-    joints = of_shape(arrays, keys["joints_m"], (count, _JOINTS, 3)).astype(np.float32)
-    if not np.isfinite(joints).all():
-        name = keys["joints_m"]
-        raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
-
-    found: dict[str, Any] = {"visible": np.ones(count, bool), "in_space": np.ones(count, bool)}
-    for name, kind, shape in (
-        ("visible", bool, (count,)),
-        ("in_space", bool, (count,)),
-        ("visible_fraction", np.float32, (count,)),
-        ("joint_visible", bool, (count, _JOINTS)),
-    ):
-        if keys[name] in arrays:
-            found[name] = of_shape(arrays, keys[name], shape).astype(kind)
-    return Truth(joints, pose_name=_names(arrays, keys["pose_name"], count), **found)
-
-
-def _names(arrays: dict[str, Any], key: str, count: int) -> np.ndarray | None:
-    """(T,) text."""
-    if key not in arrays:
-        return None
-    array = arrays[key]
-    if array.dtype.kind not in "US":
-        raise ToftrackError(f"'{key}' must be text, but is {array.dtype}")
-    if array.dtype.kind == "S":
-        array = np.char.decode(array, "utf-8", "replace")
-    return _shaped(array, key, (count,))
+    return np.char.decode(array, "utf-8", "replace") if array.dtype.kind == "S" else array
 
 
 def _side(metadata: dict[str, Any], key: str) -> str:

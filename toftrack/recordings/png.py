@@ -18,11 +18,8 @@ _LENGTH, _SIZE = struct.Struct(">I"), struct.Struct(">II")
 
 
 def read_png(path: Path, kind: type, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """An image of exactly that type and shape (colours in the order blue, green, red).
-
-    shape: None = of any size, without colours.
-
-    Raises ToftrackError when it cannot be read, is damaged, or of another kind.
+    """An image of exactly that type and shape (colours in the order blue, green, red); None = of
+    any size, without colours. ToftrackError when it cannot be read, is damaged, or of another kind.
     """
     with reported_errors(f"the image '{path}' cannot be read", "check its permissions"):
         with open_to_read(path) as stream:
@@ -43,9 +40,8 @@ def read_png(path: Path, kind: type, shape: tuple[int, ...] | None = None) -> np
 
 
 def decoded_png(content: bytes) -> np.ndarray | None:
-    """The image of a PNG file's bytes in its own type, colours in the order blue, green, red.
-
-    None where they are damaged, cut off, or none of a PNG.
+    """The image of a PNG file's bytes in its own type, colours in the order blue, green, red; None
+    where they are damaged, cut off, or none of a PNG.
     """
     if not content.startswith(SIGNATURE) or not _whole(content):
         return None

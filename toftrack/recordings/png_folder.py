@@ -35,9 +35,8 @@ _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 
 
 class PngFolder(FrameStore):
-    """The frames of a folder, read from the disk one at a time.
-
-    Raises ToftrackError where `stated`, the content of the folder's `camera.json`, makes no sense.
+    """The frames of a folder, read from the disk one at a time. Raises ToftrackError where
+    `stated`, the content of the folder's `camera.json`, makes no sense.
     """
 
     unit_m: float
@@ -51,25 +50,21 @@ class PngFolder(FrameStore):
         stated: dict[str, Any],
         bare: BareFacts,
     ) -> None:
-        self.camera = camera
+        self.camera, path = camera, folder / _CAMERA
         self._depth, self._amplitude = depth, amplitude
-        path = folder / _CAMERA
-
-        def positive(name: str, given: float | None, default: float) -> float:
-            value = stated.get(name, default) if given is None else given
-            if not is_positive(value):
-                raise ToftrackError(
-                    f"{name} must be a positive number, but is {value!r} ('{path}')"
-                )
-            return float(value)
-
         self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
         if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
             raise ToftrackError(
                 f"in '{path}', radial must be true or false, and metadata an object"
             )
-        self.unit_m = positive("depth_unit_m", bare.unit_m, MILLIMETRE)
-        self.fps = positive("fps", bare.fps, DEFAULT_FPS)
+        unit_m = bare.unit_m or stated.get("depth_unit_m", MILLIMETRE)
+        fps = bare.fps or stated.get("fps", DEFAULT_FPS)
+        for name, value in (("depth_unit_m", unit_m), ("fps", fps)):
+            if not is_positive(value):
+                raise ToftrackError(
+                    f"{name} must be a positive number, but is {value!r} ('{path}')"
+                )
+        self.unit_m, self.fps = float(unit_m), float(fps)
         times_s = _timestamps(folder / _TIMES, len(depth))
         self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
 
@@ -88,12 +83,10 @@ def read_png_folder(
 ) -> PngFolder:
     """Open a folder of depth images: the first one is checked, the others stay on the disk.
 
-    folder: its path.
-    camera_file: a camera file instead of the folder's `camera.json`.
-    bare: what is given goes before what `camera.json` says; the unit is else 0.001, fps 25.
-
-    Raises ToftrackError: there is no folder, image or camera, or the first image is not a 16-bit
-    grey PNG, or of another size than the camera's; later, another one.
+    camera_file: instead of the folder's `camera.json`.  bare: what is given goes before what
+    `camera.json` says; the unit is else 0.001, fps 25. Raises ToftrackError: there is no folder,
+    image or camera, or the first image is not a 16-bit grey PNG, or of another size than the
+    camera's; later, another one.
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
@@ -134,14 +127,9 @@ def read_png_folder(
 class PngFolderWriter:
     """Writes a folder that `read_png_folder` reads; use it with `with`.
 
-    folder: made when it does not exist; must not contain PNG images.
-    camera: goes to `camera.json`, with the facts below.
-    unit_m: metres of one step of the depth images.
-    radial: the depth is the distance along the pixel's ray.
-    fps: frames a second.
-    metadata: JSON-able.
-
-    Raises ToftrackError: the folder cannot be written or is in use.
+    folder: made when it does not exist; must not contain PNG images.  unit_m: metres of one step of
+    the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
+    ToftrackError: the folder cannot be written or is in use.
     """
 
     def __init__(
@@ -181,7 +169,6 @@ class PngFolderWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Finish `timestamps.txt`. Raises ToftrackError when it cannot be written."""
         with self._writing():
             self._times.close()
 
@@ -201,16 +188,11 @@ class PngFolderWriter:
 
 
 def _camera_content(path: Path) -> dict[str, Any] | None:
-    try:
-        content = read_json(path)
-    except FileNotFoundError:
+    if not path.exists():
         return None
-    except OSError as error:
-        raise ToftrackError(
-            f"the camera file '{path}' cannot be read ({error.strerror})"
-        ) from error
-    except ValueError:
-        raise ToftrackError(f"'{path}' is not a camera file: it is not JSON") from None
+    what = f"the camera file '{path}' cannot be read"
+    with reported_errors(what, "write it anew (docs/formats.md)", OSError, ValueError):
+        content = read_json(path)
     if not isinstance(content, dict):
         raise ToftrackError(f"'{path}' is not a camera file")
     return content
@@ -219,14 +201,9 @@ def _camera_content(path: Path) -> dict[str, Any] | None:
 def _timestamps(path: Path, count: int) -> np.ndarray | None:
     if not path.exists():
         return None
-    try:
-        with open_to_read(path) as stream:
-            text = stream.read().decode("utf-8")
-        times = np.array([float(word) for word in text.split()])
-    except OSError as error:
-        raise ToftrackError(f"'{path}' cannot be read ({error.strerror})") from error
-    except ValueError:
-        raise ToftrackError(f"'{path}' must consist of one number a line") from None
+    what, remedy = f"'{path}' cannot be read", "it must consist of one number a line"
+    with reported_errors(what, remedy, OSError, ValueError), open_to_read(path) as stream:
+        times = np.array([float(word) for word in stream.read().decode("utf-8").split()])
     if len(times) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
         raise ToftrackError(
             f"'{path}' must hold {count} finite times, one for each depth image, that do not go "

@@ -9,6 +9,7 @@ import queue
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -18,8 +19,14 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
-from toftrack.recordings.npz_pieces import compressed
-from toftrack.recordings.unfinished import IMAGE_TYPES, SUFFIX, Facts, UnfinishedRecording, finish
+from toftrack.recordings.unfinished import (
+    IMAGE_TYPES,
+    SUFFIX,
+    Facts,
+    UnfinishedRecording,
+    compressed,
+    finish,
+)
 
 _WAITING = 32
 """Frames at most that are not written yet, 1.8 MB each at 640 x 480."""
@@ -33,17 +40,10 @@ _STRANGE = 10
 class Source(Protocol):
     """Whose frames are recorded: a device, of which this is read when the first frame came."""
 
-    @property
-    def camera(self) -> Camera: ...
-
-    @property
-    def fps(self) -> float: ...
-
-    @property
-    def description(self) -> dict[str, Any]: ...
-
-    @property
-    def metadata(self) -> dict[str, Any]: ...
+    camera: Camera
+    fps: float
+    description: dict[str, Any]
+    metadata: dict[str, Any]
 
 
 class Recorder:
@@ -53,12 +53,8 @@ class Recorder:
     no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says
     so, keeps what there is, and raises nothing.
 
-    path: the recording, `.npz`.
-    source: of the frames.
-    limit_gb: 1e9 bytes of the file, after which no more frames are taken.
-    overwrite: replace an existing file.
-    tell: called with `ended`, in the recorder's thread, as soon as that is so.
-
+    limit_gb: 1e9 bytes of the file, after which no more frames are taken.  overwrite: replace an
+    existing file.  tell: called with `ended`, in the recorder's thread, as soon as that is so.
     Raises ToftrackError: the file exists, or cannot be made.
     """
 
@@ -96,21 +92,15 @@ class Recorder:
         if self.ended is not None:
             return
         # Copies: whose memory the images are in, may use it again.
-        depth, amplitude = np.array(frame.depth), frame.amplitude
-        kept = Frame(
-            frame.index,
-            frame.timestamp_s,
-            depth,
-            None if amplitude is None else np.array(amplitude),
-            frame.radial,
-        )
+        amplitude = None if frame.amplitude is None else np.array(frame.amplitude)
+        kept = replace(frame, depth=np.array(frame.depth), amplitude=amplitude)
         try:
             self._queue.put(kept, block=wait)
         except queue.Full:
             self.missed += 1
 
     def close(self) -> None:
-        """Write what waits, and finish the file; a second call does nothing."""
+        """Write what waits, and finish the file."""
         if not self._closed:
             self._closed = True
             self._queue.put(None)
@@ -205,10 +195,13 @@ class Recorder:
                 raise wrong_unit(f"the depth of the first {_STRANGE} frames", frame.depth)
 
     def _facts_of(self, frame: Frame) -> Facts:
-        about = {
-            "toftrack": version("toftrack"),
-            "device": without_whereabouts(self._source.description),
+        # As a device's facts may be given away: no serial number, no folders.
+        device = {
+            key: Path(value).name if isinstance(value, str | Path) else value
+            for key, value in self._source.description.items()
+            if "serial" not in key.lower()
         }
+        about = {"toftrack": version("toftrack"), "device": device}
         metadata = {**self._source.metadata, "recorded": about}
         return Facts(
             self._source.camera,
@@ -234,15 +227,6 @@ class Recorder:
         if why or failed:
             self.ended = reported
             self._tell(reported)
-
-
-def without_whereabouts(facts: dict[str, Any]) -> dict[str, Any]:
-    """A device's facts as they may be given away: no serial number, no folders."""
-
-    def name(value: Any) -> Any:
-        return Path(value).name if isinstance(value, str | Path) else value
-
-    return {key: name(value) for key, value in facts.items() if "serial" not in key.lower()}
 
 
 class _Clock:

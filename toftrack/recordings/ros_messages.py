@@ -39,15 +39,10 @@ def is_depth(words: str) -> bool:
 
 
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
-    """The depth image of a message.
+    """The depth image of an Image or CompressedImage: (H, W) float32 metres, 0 = no reading, new.
 
-    message: an Image or CompressedImage.
-    kind: `IMAGE` or `COMPRESSED`.
-    unit_m: metres of one step of whole numbers.
-
-    Returns (H, W) float32 metres, 0 = no reading, a new array.
-
-    Raises ToftrackError: its pixels are of another kind, or damaged; the sentence begins with "it".
+    kind: `IMAGE` or `COMPRESSED`.  unit_m: metres of one step of whole numbers. ToftrackError,
+    which begins with "it", where its pixels are of another kind, or damaged.
     """
     words = _pixels(message) if kind == IMAGE else _decompressed(message)
     if words.dtype.kind == "u":
@@ -122,25 +117,21 @@ _BROWN = ("plumb_bob", "rational_polynomial")
 
 
 def camera_of(info: Any, rectified: bool) -> Camera:
-    """The camera of depth images.
+    """The camera of depth images, of a CameraInfo of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
 
     Distortion models: `plumb_bob` and `rational_polynomial` (OpenCV's 4, 5, 8, 12 or 14
-    coefficients), `equidistant` (OpenCV's fisheye), and none at all.
-
-    info: a CameraInfo of ROS 1 (fields D, K, P) or ROS 2 (d, k, p).
-    rectified: the images are free of distortion already: what they are seen through is P.
-
-    Raises ToftrackError: it is not calibrated or of another model; the sentence begins with "it".
+    coefficients), `equidistant` (OpenCV's fisheye), and none at all.  rectified: the images are
+    free of distortion already: what they are seen through is P. ToftrackError, which begins with
+    "it", where it is not calibrated or of another model.
     """
-    K = _matrix(info, "K", (3, 3))
-    P = _matrix(info, "P", (3, 4))
+    stated = {name: np.asarray(_field(info, name), np.float64).ravel() for name in "KPD"}
+    K, P, distortion = stated["K"].reshape(3, 3), stated["P"].reshape(3, 4), stated["D"]
     if rectified and P[0, 0] > 0:
         return Camera(*_window(info, np.diag([P[0, 0], P[1, 1], 1.0]), P[0, 2], P[1, 2]))
     if not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ToftrackError("it is not calibrated (K is zero); give one with camera.file=FILE")
     focal = np.diag([K[0, 0], K[1, 1], 1.0])
     placed = _window(info, focal, K[0, 2], K[1, 2])
-    distortion = np.asarray(_field(info, "D"), np.float64).ravel()
     model = str(info.distortion_model)
     if rectified or not distortion.any() and model != "equidistant":
         return Camera(*placed)
@@ -163,10 +154,6 @@ def _window(info: Any, focal: np.ndarray, cx: float, cy: float) -> tuple[np.ndar
     # As image_geometry has it, without the half pixel by which a bin's centre lies elsewhere.
     K[:2, 2] = np.array((cx - roi.x_offset, cy - roi.y_offset)) / bins
     return K, int(size[0]), int(size[1])
-
-
-def _matrix(info: Any, name: str, shape: tuple[int, int]) -> np.ndarray:
-    return np.asarray(_field(info, name), np.float64).reshape(shape)
 
 
 def _field(info: Any, name: str) -> Any:

@@ -51,14 +51,12 @@ class RosBag(FrameStore):
 
     unit_m: float
 
-    def __init__(
-        self, bag: _Bag, topic: _Topic, camera: Camera, times: _Times, unit_m: float
-    ) -> None:
+    def __init__(self, bag: _Bag, topic: _Topic, camera: Camera, unit_m: float) -> None:
         self.path, self.camera, self.unit_m = bag.path, camera, unit_m
-        self.timestamp_s = times.seconds
-        self.fps, self.damage = rate_of(times.seconds), times.damage
+        self.timestamp_s, self._recorded_ns, self.damage = _times(bag, topic)
+        self.fps = rate_of(self.timestamp_s)
         self.metadata = {"topic": topic.name, "encoding": topic.encoding}
-        self._bag, self._topic, self._recorded_ns = bag, topic, times.recorded_ns
+        self._bag, self._topic = bag, topic
         self._messages: Iterator[tuple[int, Any]] | None = None
         self._next = 0
 
@@ -85,7 +83,7 @@ class RosBag(FrameStore):
 
     def _go_to(self, index: int) -> None:
         start_ns = int(self._recorded_ns[index])
-        self._messages = self._bag.messages(self._topic, start_ns)
+        self._messages = self._bag.messages(self._topic.name, self._topic.kind, start_ns)
         # Several messages may have been recorded at the same time.
         before = index - int(np.searchsorted(self._recorded_ns, start_ns))
         for _ in islice(self._messages, before):
@@ -100,13 +98,11 @@ def read_rosbag(
 ) -> RosBag:
     """Open a bag and read its times.
 
-    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.
-    topic: of the depth images; None = the only one there is.
-    camera_file: a camera file instead of the bag's camera_info.
-    unit_m: metres of one step of 16UC1; None = a millimetre, as ROS says.
-
-    Raises ToftrackError: rosbags is not installed, the bag is damaged, it has no depth images or
-    several topics of them, or nothing tells their lens; one sentence.
+    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  topic: of the depth images;
+    None = the only one there is.  camera_file: instead of the bag's camera_info.  unit_m: metres of
+    one step of 16UC1; None = a millimetre, as ROS says. Raises ToftrackError: rosbags is not
+    installed, the bag is damaged, it has no depth images or several topics of them, or nothing
+    tells their lens; one sentence.
     """
     path = Path(path).expanduser()
     if not path.exists():
@@ -119,9 +115,8 @@ def read_rosbag(
         chosen = _choose(bag, topic)
         camera = _camera(bag, chosen) if camera_file is None else Camera.load(camera_file)
         first = _image(path, chosen, chosen.first, unit_m, 0)
-        what = f"the first image of {chosen.name} in '{path}'"
-        check_metres(first, what, _OTHER_UNIT)
-        return RosBag(bag, chosen, camera, _times(bag, chosen), unit_m)
+        check_metres(first, f"the first image of {chosen.name} in '{path}'", _OTHER_UNIT)
+        return RosBag(bag, chosen, camera, unit_m)
     finally:
         bag.close()
 
@@ -148,33 +143,29 @@ class _Bag:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._is_one = path.suffix.lower() == ".bag" and path.is_file()
         try:
-            self._one = importlib.import_module("rosbags.rosbag1")
-            self._two = importlib.import_module("rosbags.rosbag2")
+            self._rosbags = importlib.import_module(f"rosbags.rosbag{1 if self._is_one else 2}")
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise ToftrackError(
                 f"'{path}' is read by rosbags ({error}): pip install -e '.[ros]' (recordings of "
                 "cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
             ) from error
-        self._is_one = path.suffix.lower() == ".bag" and path.is_file()
         # The messages that are read are the same in every release of ROS 2.
         store = types.Stores.ROS1_NOETIC if self._is_one else types.Stores.ROS2_HUMBLE
         self._types = types.get_typestore(store)
         self._reader: Any = None
 
     def reader(self) -> Any:
-        """The opened reader of rosbags."""
         if self._reader is None:
             with self._reported():
-                make = self._one.Reader if self._is_one else self._two.Reader
-                reader = make(storage_of(self.path))
+                reader = self._rosbags.Reader(storage_of(self.path))
                 reader.open()
             self._reader = reader
         return self._reader
 
     def close(self) -> None:
-        """Close the file, if it is open."""
         reader, self._reader = self._reader, None
         if reader is not None:
             reader.close()
@@ -184,13 +175,8 @@ class _Bag:
         connections = self.reader().connections
         return sorted({c.topic for c in connections if c.msgtype == kind and c.msgcount})
 
-    def all_topics(self) -> list[str]:
-        """The names of all topics."""
-        return sorted({connection.topic for connection in self.reader().connections})
-
-    def messages(self, topic: _Topic | tuple[str, str], start_ns: int = 0) -> Iterator[Any]:
-        """When recorded, ns, and the message, of a topic (or a name and a type), from then on."""
-        name, kind = topic if isinstance(topic, tuple) else (topic.name, topic.kind)
+    def messages(self, name: str, kind: str, start_ns: int = 0) -> Iterator[Any]:
+        """When recorded, ns, and the message, of a topic and type, from then on."""
         reader = self.reader()
         connections = [c for c in reader.connections if (c.topic, c.msgtype) == (name, kind)]
         parse = self._types.deserialize_ros1 if self._is_one else self._types.deserialize_cdr
@@ -203,8 +189,6 @@ class _Bag:
         """What rosbags says of a damaged bag becomes one sentence; it raises errors of any kind."""
         try:
             yield
-        except ToftrackError:
-            raise
         except Exception as error:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ToftrackError(
@@ -216,7 +200,7 @@ class _Bag:
 def _choose(bag: _Bag, wanted: str | None) -> _Topic:
     """The topic of depth images; ToftrackError, with those there are, where it is not clear."""
     for start, device in _OF_CAMERAS.items():
-        if any(name.startswith(start) for name in bag.all_topics()):
+        if any(connection.topic.startswith(start) for connection in bag.reader().connections):
             raise ToftrackError(
                 f"'{bag.path}' is a recording of a camera's own program, which only that can read: "
                 f"play it with device={device} device.bag=FILE"
@@ -249,10 +233,15 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
 
 def _image_topics(bag: _Bag) -> Iterator[_Topic]:
     for kind in (IMAGE, COMPRESSED):
-        for name in bag.topics(kind):
-            first = next(bag.messages((name, kind)), None)
-            if first is not None:
-                yield _Topic(name, kind, encoding(first[1], kind), first[1])
+        for name, first in _firsts(bag, kind):
+            yield _Topic(name, kind, encoding(first, kind), first)
+
+
+def _firsts(bag: _Bag, kind: str) -> Iterator[tuple[str, Any]]:
+    """The topics of a type, each with its first message."""
+    for name in bag.topics(kind):
+        for _, first in islice(bag.messages(name, kind), 1):
+            yield name, first
 
 
 def _listed(topics: list[_Topic]) -> str:
@@ -262,8 +251,7 @@ def _listed(topics: list[_Topic]) -> str:
 def _camera(bag: _Bag, topic: _Topic) -> Camera:
     """The lens of a topic's images: its camera_info, wherever in the bag that comes."""
     sibling = f"{topic.base.rpartition('/')[0]}/camera_info"
-    firsts = {n: next(bag.messages((n, CAMERA_INFO)), None) for n in bag.topics(CAMERA_INFO)}
-    infos = {name: first[1] for name, first in firsts.items() if first is not None}
+    infos = dict(_firsts(bag, CAMERA_INFO))
     if sibling not in infos:
         frame = topic.first.header.frame_id
         fitting = [name for name, info in infos.items() if frame and info.header.frame_id == frame]
@@ -291,24 +279,16 @@ def _image(path: Path, topic: _Topic, message: Any, unit_m: float, index: int) -
         ) from None
 
 
-@dataclass(frozen=True, eq=False)
-class _Times:
-    seconds: np.ndarray
-    """(T,) float64: when the images were taken, by their own stamps, or when they were recorded,
-    where those make no sense."""
-    recorded_ns: np.ndarray
-    """(T,) int64, not decreasing: by it the messages are found."""
-    damage: str | None
-    """What ended the bag before its end."""
-
-
-def _times(bag: _Bag, topic: _Topic) -> _Times:
-    """The times of a topic's messages, up to where the bag can be read."""
+def _times(bag: _Bag, topic: _Topic) -> tuple[np.ndarray, np.ndarray, str | None]:
+    """Of a topic's messages, up to where the bag can be read: (T,) seconds when the images were
+    taken, by their own stamps (when recorded, where those make no sense); (T,) int64 nanoseconds
+    when recorded, not decreasing, by which messages are found; and what ended the bag too early.
+    """
     stamps: list[int] = []
     recorded: list[int] = []
     damage = None
     try:
-        for recorded_ns, message in bag.messages(topic):
+        for recorded_ns, message in bag.messages(topic.name, topic.kind):
             if recorded and recorded_ns < recorded[-1]:
                 raise ToftrackError(f"the messages of '{bag.path}' are out of order")
             stamp = message.header.stamp
@@ -321,5 +301,5 @@ def _times(bag: _Bag, topic: _Topic) -> _Times:
     taken = np.array(stamps, np.int64)
     # Some drivers leave the stamps empty, or count them by two clocks.
     sound = taken[0] > 0 and (np.diff(taken) >= 0).all() and (len(taken) < 2 or np.ptp(taken) > 0)
-    times = taken if sound else np.array(recorded, np.int64)
-    return _Times(times / 1e9, np.array(recorded, np.int64), damage)
+    recorded_at = np.array(recorded, np.int64)
+    return (taken if sound else recorded_at) / 1e9, recorded_at, damage

@@ -28,9 +28,8 @@ _WORD = np.dtype("<u2")
 
 
 def unambiguous_range_m(modulation_mhz: int) -> float:
-    """c / 2f, metres: what the largest distance word stands for.
-
-    Raises ToftrackError for a frequency that the camera does not have.
+    """c / 2f, metres: what the largest distance word stands for; ToftrackError for a frequency that
+    the camera does not have.
     """
     if modulation_mhz not in MODULATION_CODES:
         raise ToftrackError(
@@ -49,16 +48,11 @@ def nominal_camera() -> Camera:
 def decode_frame(
     data: bytes, range_m: float, amplitude_threshold: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The images of a raw frame.
+    """The images of a raw frame of FRAME_BYTES bytes (else ToftrackError), new arrays: (144, 176)
+    float32 metres along each pixel's ray, 0 = no reading, and the (144, 176) uint16 amplitude.
 
-    data: FRAME_BYTES bytes.
-    range_m: what the largest distance word stands for, metres.
-    amplitude_threshold: pixels of a smaller amplitude become "no reading".
-
-    Returns (144, 176) float32 metres along each pixel's ray, 0 = no reading, and the (144, 176)
-    uint16 amplitude; both are new arrays.
-
-    Raises ToftrackError: the frame does not have FRAME_BYTES bytes.
+    range_m: what the largest distance word stands for.  amplitude_threshold: pixels of a smaller
+    amplitude become "no reading".
     """
     if len(data) != FRAME_BYTES:
         raise ToftrackError(
@@ -75,12 +69,9 @@ def decode_frame(
 def encode_frame(radial_m: np.ndarray, amplitude: np.ndarray | None, range_m: float) -> bytes:
     """The raw frame of two images; `decode_frame` gives them back, distances to range_m / 131070.
 
-    radial_m: (144, 176) metres along each pixel's ray. What is no number, not above 0 or beyond the
-        range becomes 0, "no reading".
-    amplitude: (144, 176) uint16; None gives zeros.
-    range_m: what the largest distance word stands for, metres.
-
-    Raises ToftrackError: an image is not of the camera's size.
+    radial_m: (144, 176) metres along each pixel's ray; what is no number, not above 0 or beyond the
+    range becomes 0, "no reading".  amplitude: (144, 176) uint16; None gives zeros. ToftrackError
+    where an image is not of the camera's size.
     """
     for image in (radial_m, amplitude):
         if image is not None and image.shape != (HEIGHT, WIDTH):

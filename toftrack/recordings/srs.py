@@ -20,7 +20,6 @@ from __future__ import annotations
 import json
 import os
 import struct
-from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO, Self
@@ -30,7 +29,7 @@ import numpy as np
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
-from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, rate_of
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     FRAME_BYTES,
@@ -65,31 +64,18 @@ class SrsInit:
 
 @dataclass(frozen=True)
 class SrsFacts:
-    """What toftrack adds to the format."""
+    """What toftrack adds to the format; None = not stated."""
 
     range_m: float | None = None
-    """What the largest distance word stands for; None = not stated."""
+    """What the largest distance word stands for."""
     camera: Camera | None = None
-    """None = not stated."""
     fps: float = DEFAULT_FPS
     metadata: dict[str, Any] = field(default_factory=dict)
 
 
-def facts_text(facts: SrsFacts) -> bytes:
-    """The content of a TOFT object."""
-    content = {
-        "range_m": facts.range_m,
-        "fps": facts.fps,
-        "camera": facts.camera and facts.camera.to_dict(),
-        "metadata": facts.metadata,
-    }
-    return json.dumps(content).encode()
-
-
-def parse_facts(path: Path, text: bytes) -> SrsFacts:
-    """What the content of a TOFT object says; `path` is for the message.
-
-    Raises ToftrackError: what the recorder stated must not be replaced by a guess in silence.
+def _parse_facts(path: Path, text: bytes) -> SrsFacts:
+    """What the content of a TOFT object says; `path` is for the message. Raises ToftrackError: what
+    the recorder stated must not be replaced by a guess in silence.
     """
     try:
         content = parse_json(text)
@@ -112,13 +98,8 @@ class SrsWriter:
     Each frame reaches the operating system before `append` returns, so that a killed program leaves
     a file that is readable to its last whole frame.
 
-    path: the new file.
-    init: which camera.
-    registers: the camera's 64 register bytes as far as they are known.
-    facts: what else there is to say.
-    overwrite: replace an existing file.
-
-    Raises ToftrackError: the file exists already or cannot be written.
+    registers: the camera's 64 register bytes as far as they are known. Raises ToftrackError: the
+    file exists already (without `overwrite`) or cannot be written.
     """
 
     def __init__(
@@ -133,44 +114,38 @@ class SrsWriter:
         self.frames = 0
         """Whole frames written."""
         init, facts = init or SrsInit(), facts or SrsFacts()
-        try:
-            self._file = GrowingFile(self.path, overwrite)
-        except FileExistsError:
+        numbers = (init.product_id, init.interface_type, init.serial_number)
+        about = {
+            "range_m": facts.range_m,
+            "fps": facts.fps,
+            "camera": facts.camera and facts.camera.to_dict(),
+            "metadata": facts.metadata,
+        }
+        if not overwrite and os.path.lexists(self.path):
             raise ToftrackError(
                 f"the file '{self.path}' exists already; choose another name or give --overwrite"
-            ) from None
-        except OSError as error:
-            raise ToftrackError(
-                f"the recording '{self.path}' cannot be written ({error.strerror}); choose another "
-                "place"
-            ) from error
+            )
+        what = f"the recording '{self.path}' cannot be written"
+        with reported_errors(what, "choose another place"):
+            self._file = GrowingFile(self.path, overwrite)
         try:
-            numbers = (init.product_id, init.interface_type, init.serial_number)
             self._write(
                 _PAIR.pack(_SIGNATURE, _VERSION)
                 + _object(_INIT, _THREE.pack(*(n & 0xFFFFFFFF for n in numbers)))
-                + _object(_FACTS, facts_text(facts))
+                + _object(_FACTS, json.dumps(about).encode())
+                + _object(_CONFIGURE, registers)
             )
-            self.configure(registers)
         except BaseException:
             self.close()
             raise
 
     @property
     def size_bytes(self) -> int:
-        """Of the file."""
         return self._file.bytes
 
-    def configure(self, registers: bytes) -> None:
-        """The 64 registers under which the frames that follow are taken."""
-        if len(registers) != REGISTERS:
-            raise ToftrackError(f"the SR3000 has {REGISTERS} registers, but {len(registers)} came")
-        self._write(_object(_CONFIGURE, registers))
-
     def append(self, data: bytes, timestamp_s: float) -> None:
-        """Add a raw frame of FRAME_BYTES bytes, received at `timestamp_s`.
-
-        Raises ToftrackError when it cannot be written; the file then ends with the frame before.
+        """Add a raw frame, received at `timestamp_s`. ToftrackError when it cannot be written; the
+        file then ends with the frame before.
         """
         if len(data) != FRAME_BYTES:
             raise ToftrackError(f"a frame has {FRAME_BYTES} bytes, but {len(data)} came")
@@ -178,7 +153,6 @@ class SrsWriter:
         self.frames += 1
 
     def close(self) -> None:
-        """Close the file; a second call does nothing."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -194,10 +168,7 @@ class SrsWriter:
 
 
 class SrsRecording(FrameStore):
-    """The frames of a `.srs` file, read from the disk one at a time.
-
-    `image` opens the file when it is first needed and `close` closes it.
-    """
+    """The frames of a `.srs` file, read from the disk one at a time."""
 
     radial = True
 
@@ -220,7 +191,7 @@ class SrsRecording(FrameStore):
 
     def raw(self, index: int) -> bytes:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
-        with _reading(self.path):
+        with reading(self.path):
             if self._stream is None:
                 self._stream = open_to_read(self.path)
             self._stream.seek(int(self._offsets[index]))
@@ -243,20 +214,12 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
 
     A file that is cut off or damaged somewhere is usable up to there (`damage` says so).
 
-    path: the file.
     modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
-        registers whose meaning is not public).
-
-    Raises ToftrackError: the file is missing, not a stream file, of another version, in a wrong
-    order or without any whole frame.
+    registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
+    file, of another version, in a wrong order or without any whole frame.
     """
-    path = Path(path).expanduser()
-    if path.is_dir():
-        raise ToftrackError(f"'{path}' is a directory; give the path of a recording (.srs)")
-    default_range_m = unambiguous_range_m(modulation_mhz)
-    if not path.exists():
-        raise ToftrackError(f"there is no file '{path}'; give the path of a recording (.srs)")
-    with _reading(path), open_to_read(path) as stream:
+    path, default_range_m = file_of(path, " (.srs)"), unambiguous_range_m(modulation_mhz)
+    with reading(path), open_to_read(path) as stream:
         scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
     if not scan.offsets:
         reason = f" ({scan.damage})" if scan.damage else ""
@@ -351,13 +314,8 @@ def _other(path: Path, scan: _Scan, kind: int, stream: BinaryIO, length: int) ->
             raise ToftrackError(f"the Configure object of '{path}' is damaged; record it again")
         scan.registers = stream.read(length)
     elif kind == _FACTS and length <= _LARGEST_FACTS:
-        scan.facts = parse_facts(path, stream.read(length))
+        scan.facts = _parse_facts(path, stream.read(length))
 
 
 def _object(kind: int, content: bytes) -> bytes:
     return _PAIR.pack(kind, _PAIR.size + len(content)) + content
-
-
-def _reading(path: Path) -> AbstractContextManager[None]:
-    what = f"the recording '{path}' cannot be read"
-    return reported_errors(what, "check the file and its permissions")

@@ -22,21 +22,24 @@ _BY_OPENNI = (
     "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
     "(docs/formats.md) and give the folder"
 )
+_BY_IMAGES = "export its depth frames as 16-bit PNG images or .npy, and convert those"
+_BY_NUMBERS = "save the depth images as 16-bit PNG, numbered, and give their folder"
+_BY_ARRAY = "save its depth as .npy (frames, rows, columns), and convert that"
 _BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
 FIRST_SAMPLE = "right_hand"
 SAMPLES = (FIRST_SAMPLE, "left_hand", "two_hands", "point_and_pinch", "glass")
 """The recordings that come with the package; toftrack/data/README.md says what they show."""
 ELSEWHERE = {
     ".oni": _BY_OPENNI,
-    ".xef": "export its depth frames as 16-bit PNG images or .npy, and convert those",
-    ".rrf": "export its depth frames as 16-bit PNG images or .npy, and convert those",
+    ".xef": _BY_IMAGES,
+    ".rrf": _BY_IMAGES,
     ".ply": _BY_POINTS,
     ".pcd": _BY_POINTS,
     ".png": "a recording is the folder that the images lie in; give that",
-    ".tif": "save the depth images as 16-bit PNG, numbered, and give their folder",
-    ".tiff": "save the depth images as 16-bit PNG, numbered, and give their folder",
-    ".h5": "save its depth as .npy (frames, rows, columns), and convert that",
-    ".hdf5": "save its depth as .npy (frames, rows, columns), and convert that",
+    ".tif": _BY_NUMBERS,
+    ".tiff": _BY_NUMBERS,
+    ".h5": _BY_ARRAY,
+    ".hdf5": _BY_ARRAY,
     ".raw": "say what it is: read it with numpy, save .npy (frames, rows, columns), convert that",
 }
 """What to do with files of other kinds."""
@@ -49,18 +52,13 @@ def open_recording(
     topic: str | None = None,
     bare: BareFacts = NOTHING_GIVEN,
 ) -> FrameStore:
-    """Open a recording, whose kind follows from its name.
-
-    Only `.npz` is loaded as a whole; the others stay on the disk.
+    """Open a recording, whose kind follows from its name. Only `.npz` is loaded as a whole.
 
     path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder with
-        metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.
-    camera_file: serves what has no camera of its own.
-    modulation_mhz: tells the range of a `.srs` that does not state it.
-    topic: of a ROS bag that has several of depth images.
-    bare: what is known of images that say nothing of themselves.
-
-    Raises ToftrackError: it cannot be used; one sentence that names it.
+    metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.  camera_file, bare: of
+    what has no camera of its own, and says nothing of itself.  modulation_mhz: tells the range of a
+    `.srs` that does not state it.  topic: of a ROS bag that has several of depth images. Raises
+    ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
@@ -83,9 +81,7 @@ def open_recording(
 
 def open_source(name: str) -> FrameStore:
     """What a virtual camera sees: the packaged recording for `sample`, else as `open_recording`."""
-    if name != "sample":
-        return open_recording(name)
-    return open_sample()
+    return open_sample() if name == "sample" else open_recording(name)
 
 
 def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
@@ -95,9 +91,8 @@ def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
 
 
 def packaged_sample(name: str = FIRST_SAMPLE) -> AbstractContextManager[Path]:
-    """A recording that comes with the package, as a file while the context is open.
-
-    Raises ToftrackError when there is none of that name; it lists those that there are.
+    """A recording that comes with the package, as a file while the context is open. Raises
+    ToftrackError when there is none of that name; it lists those that there are.
     """
     return resources.as_file(resources.files("toftrack") / "data" / sample_file(name))
 

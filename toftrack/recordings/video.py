@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.json_text import parse_json
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
-from toftrack.recordings.frame_store import FrameStore, rate_of
+from toftrack.recordings.frame_store import FrameStore, file_of, rate_of
 
 VIDEOS = frozenset(".mkv .avi .mov .mp4 .m4v .webm .mpg .mpeg .wmv .nut".split())
 """How the names of videos end."""
@@ -46,12 +46,12 @@ class DepthVideo(FrameStore):
         times_s = self._depth.times_s + (0.0 if kinect is None else kinect.offset_s)
         self.camera, self.damage = camera, damage
         self.metadata = {} if kinect is None else kinect.facts
-        self.unit_m = MILLIMETRE if bare.unit_m is None else bare.unit_m
+        self.unit_m = bare.unit_m or MILLIMETRE
         self.fps = bare.fps or rate_of(times_s)
         self.timestamp_s = np.arange(len(times_s)) / bare.fps if bare.fps else times_s
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        """As of every store; an infrared image that is missing is black."""
+        """An infrared image that is missing is black."""
         depth = self._depth.image(index).astype(np.float32) * np.float32(self.unit_m)
         if self._amplitude is None:
             return depth, None
@@ -86,34 +86,28 @@ class Track:
 
     def image(self, number: int) -> np.ndarray:
         """(H, W) uint16, a new array. Raises ToftrackError when it is damaged."""
-        import av  # takes a while, and most recordings are no videos
-
-        try:
+        with reported_errors(
+            f"frame {number} of '{self._path}' cannot be decoded",
+            "copy or record it again",
+            *_errors(),
+        ):
             if self._images is None or number != self._next:
                 self._go_to(number)
             assert self._images is not None
-            image = next(frame for frame in self._images if frame.pts >= self.ticks[number])
+            image = next((frame for frame in self._images if frame.pts >= self.ticks[number]), None)
             self._next = number + 1
-            if image.pts != self.ticks[number]:
-                raise ToftrackError(
-                    f"frame {number} of '{self._path}' is damaged; copy or record it again"
-                )
-            return image.to_ndarray().astype(np.uint16)
-        except (av.FFmpegError, OSError, StopIteration) as error:
-            raise ToftrackError(
-                f"frame {number} of '{self._path}' cannot be decoded ({_reason(error)}); copy or "
-                "record it again"
-            ) from error
+            if image is not None and image.pts == self.ticks[number]:
+                return image.to_ndarray().astype(np.uint16)
+        raise ToftrackError(f"frame {number} of '{self._path}' is damaged; copy or record it again")
 
     def close(self) -> None:
-        """Close the file, if it is open."""
         container, self._container, self._images = self._container, None, None
         if container is not None:
             container.close()
 
     def _go_to(self, number: int) -> None:
         if self._container is None:
-            self._container = opened(self._path)
+            self._container = _opened(self._path)
         stream = self._container.streams[self._stream]
         self._container.seek(int(self.ticks[number]), stream=stream)
         self._images = self._container.decode(stream)
@@ -123,23 +117,20 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
     """Open a video of depth images.
 
     path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
-    camera_file: a camera file; None = the recording's own calibration, or what is given.
-    bare: intrinsics, unit (a millimetre) and frame rate of a video that does not tell them.
-
-    Raises ToftrackError: it is damaged, has colour images or no depth, or nothing tells its camera.
+    camera_file: None = the recording's own calibration, or what is given.  bare: intrinsics, unit
+    (a millimetre) and frame rate of a video that does not tell them. Raises ToftrackError: it is
+    damaged, has colour images or no depth, or nothing tells its camera.
     """
-    path = Path(path).expanduser()
-    if not path.is_file():
-        raise ToftrackError(f"there is no file '{path}'; give the path of a recording")
-    container = opened(path)
+    path = file_of(path)
+    container = _opened(path)
     try:
-        own = kinect_of(container, path)
+        own = _kinect_of(container, path)
         number = _grey_stream(container, path, None if own is None else own.depth)
         shape = container.streams[number].width, container.streams[number].height
         if camera_file is not None or own is None:
             camera = bare_camera(path, camera_file, bare, *shape)
         else:
-            camera = camera_of(container, path, *shape)
+            camera = _camera_of(container, path, *shape)
         infrared = [] if own is None else own.infrared
         grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
         return DepthVideo(camera, bare, own, *_scanned(container, path, [number, *grey]))
@@ -147,18 +138,21 @@ def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts
         container.close()
 
 
-def opened(path: Path) -> Any:
+def _opened(path: Path) -> Any:
     """The container of PyAV; ToftrackError when the file is no video."""
     import av  # takes a while, and most recordings are no videos
 
-    try:
+    remedy = "it is damaged, cut off or of another kind"
+    with reported_errors(f"'{path}' cannot be read as a video", remedy, *_errors()):
         # A damaged text among the tags is no reason to refuse the images.
         return av.open(str(path), metadata_errors="replace")
-    except (av.FFmpegError, OSError) as error:
-        raise ToftrackError(
-            f"'{path}' cannot be read as a video ({_reason(error)}); it is damaged, cut off or of "
-            "another kind"
-        ) from error
+
+
+def _errors() -> tuple[type[Exception], ...]:
+    """What PyAV raises of a damaged file."""
+    import av
+
+    return (av.FFmpegError, OSError)
 
 
 def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
@@ -179,12 +173,9 @@ def _grey_stream(container: Any, path: Path, wanted: int | None) -> int:
 
 
 def _scanned(container: Any, path: Path, streams: Sequence[int]) -> tuple[list[Track], str | None]:
-    """Some tracks with the times of their images, and what ended the file before its end.
-
-    Raises ToftrackError when the first track has no image.
+    """Some tracks with the times of their images, and what ended the file before its end. Raises
+    ToftrackError when the first track has no image.
     """
-    import av
-
     ticks: dict[int, list[int]] = {number: [] for number in streams}
     damage = None
     try:
@@ -195,8 +186,8 @@ def _scanned(container: Any, path: Path, streams: Sequence[int]) -> tuple[list[T
                 damage = "it breaks off within a frame"
                 break
             ticks[packet.stream_index].append(packet.pts)
-    except (av.FFmpegError, OSError) as error:
-        damage = f"it is damaged further on ({_reason(error)})"
+    except _errors() as error:
+        damage = f"it is damaged further on ({getattr(error, 'strerror', None) or error})"
     if not ticks[streams[0]]:
         raise ToftrackError(f"'{path}' has no frame of depth ({damage or 'it is empty'})")
     tracks = [
@@ -223,10 +214,6 @@ def _least(stream: Any) -> int:
     return 2 * stream.width * stream.height if raw else 1
 
 
-def _reason(error: BaseException) -> str:
-    return getattr(error, "strerror", None) or str(error) or type(error).__name__
-
-
 _SENSOR_PX = 1024
 """Width and height of the depth sensor."""
 _MODES = {
@@ -244,46 +231,41 @@ _ADVICE = "give a calibrated camera with camera.file=FILE"
 
 @dataclass(frozen=True)
 class Kinect:
-    """What a recording of an Azure Kinect says of itself: its tracks, by their numbers, ..."""
+    """What a recording of an Azure Kinect says of itself.
+
+    depth, infrared: numbers of its tracks, of infrared one or none.  offset_s: of the camera's
+    clock at the file's time 0.  facts: for the recording's metadata, JSON-able.
+    """
 
     depth: int
     infrared: list[int]
-    """None or one."""
     offset_s: float
-    """Of the camera's clock at the file's time 0."""
     facts: dict[str, Any]
-    """JSON-able, for the recording's metadata."""
 
 
-def kinect_of(container: Any, path: Path) -> Kinect | None:
-    """What an Azure Kinect's recording says of itself; None for every other video.
-
-    Raises ToftrackError when it was recorded without depth.
+def _kinect_of(container: Any, path: Path) -> Kinect | None:
+    """What an Azure Kinect's recording says of itself; None for every other video. Raises
+    ToftrackError when it was recorded without depth.
     """
-    named = {title: _track(container, title) for title in ("DEPTH", "IR")}
-    if named["DEPTH"] is None:
+    depth, infrared = _tracks(container, "DEPTH"), _tracks(container, "IR")
+    if not depth:
         if not any(key.startswith("K4A_") for key in container.metadata):
             return None
         raise ToftrackError(
             f"'{path}' is a recording of an Azure Kinect without depth; record it with a depth "
             "mode (k4arecorder --depth-mode NFOV_UNBINNED)"
         )
-    depth = container.streams[named["DEPTH"]]
-    tags = {**depth.metadata, **container.metadata}
+    tags = {**container.streams[depth[0]].metadata, **container.metadata}
     names = {"camera": "title", "serial": "K4A_DEVICE_SERIAL_NUMBER", "mode": "K4A_DEPTH_MODE"}
+    facts = {key: tags[name] for key, name in names.items() if name in tags}
     offset = tags.get("K4A_START_OFFSET_NS", "")
-    return Kinect(
-        depth=named["DEPTH"],
-        infrared=[] if named["IR"] is None else [named["IR"]],
-        offset_s=int(offset) / 1e9 if offset.isdecimal() else 0.0,
-        facts={key: tags[name] for key, name in names.items() if name in tags},
-    )
+    offset_s = int(offset) / 1e9 if offset.isdecimal() else 0.0
+    return Kinect(depth[0], infrared, offset_s, facts)
 
 
-def camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
-    """The depth camera for images of that size, from the attached calibration.
-
-    Raises ToftrackError when that is missing, damaged, or of a kind that no shipped camera has.
+def _camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
+    """The depth camera for images of that size, from the attached calibration. Raises ToftrackError
+    when that is missing, damaged, or of a kind that no shipped camera has.
     """
     text = _attachment(container)
     if text is None:
@@ -319,11 +301,13 @@ def camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
         raise ToftrackError(f"the {_CALIBRATION} in '{path}': {error}; {_ADVICE}") from None
 
 
-def _track(container: Any, title: str) -> int | None:
-    for stream in container.streams.video:
-        if stream.metadata.get("title") == title or f"K4A_{title}_TRACK" in stream.metadata:
-            return int(stream.index)
-    return None
+def _tracks(container: Any, title: str) -> list[int]:
+    """The number of the track of that title, if there is one."""
+    return [
+        int(stream.index)
+        for stream in container.streams.video
+        if stream.metadata.get("title") == title or f"K4A_{title}_TRACK" in stream.metadata
+    ][:1]
 
 
 def _attachment(container: Any) -> str | None:

@@ -16,7 +16,7 @@ from helpers.hands import hand_estimate
 from helpers.settings import part
 from helpers.tracking import make_tracker
 
-from toftrack.devices.sample import Sample
+from toftrack.devices.replay import Sample
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
 

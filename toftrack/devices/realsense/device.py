@@ -1,49 +1,38 @@
-"""A RealSense depth camera, live or recorded, through Intel's SDK (`pip install pyrealsense2`)."""
+"""A RealSense depth camera, live or recorded, through Intel's SDK (`pip install pyrealsense2`).
+
+The package is imported only when a RealSense camera is used: `rs` below is the imported module.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import functools
-import logging
+import importlib
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from toftrack.devices.live import BUSY, OTHER_FILE, SdkCamera, Size
-from toftrack.devices.realsense import sdk
+from toftrack.camera import Camera
+from toftrack.devices.live import OTHER_FILE, SdkCamera, Size, chosen_profile, chosen_serial
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames import Frame
 
-_log = logging.getLogger(__name__)
 _SUFFIXES = (".bag", ".db3")
 _SLICE_MS = 100  # of waiting, between looks at what else may have happened
+_WORST_FIT_PX = 0.5
 
 
 class RealSense(SdkCamera):
     """Depth as Z along the optical axis, infrared as amplitude, by the camera's own intrinsics.
 
-    Args:
-        transport: `usb`, or `emulated` (the SDK's software device, which sees a recording).
-        bag: a recording of the SDK (`.bag`, `.db3`) instead of a camera.
-        serial: which camera; None = the only one.
-        width, height, fps: of a live camera's images.
-        infrared: deliver infrared images of the same size as amplitude, where there are any.
-        preset: of the camera, by name, as `hand` or `high_accuracy`; None = as it is.
-        keep: `newest` delivers the newest frame and drops older ones that nobody has taken;
-            `every` lets up to `queue_frames` wait. A recording delivers all unless `realtime`.
-        queue_frames: see `keep`.
-        start: first frame; the ones before are left out.
-        stop: end before this index; None = go on.
-        timeout_s: so long without a frame means that the camera does not answer.
-        realtime: replay a recording at its own pace, dropping what comes too late.
-        camera_file: a calibrated camera instead of the camera's own intrinsics.
-        emulated: settings of the virtual camera.
-
-    Raises:
-        ToftrackError: a setting makes no sense, pyrealsense2 is not installed, there is no camera,
-            the recording cannot be used, or there are no depth images of that size.
+    The arguments are those of conf/device/realsense.yaml. Raises ToftrackError: a setting makes no
+    sense, pyrealsense2 is not installed, there is no camera, the recording cannot be used, or there
+    are no depth images of that size.
     """
 
     kind, maker = "realsense", "RealSense"
@@ -81,7 +70,7 @@ class RealSense(SdkCamera):
                 f"{' or '.join(_SUFFIXES)}; replay other recordings with device=replay "
                 "device.path=FILE"
             )
-        rs = self._rs = sdk.load_sdk()
+        rs = self._rs = load_sdk()
         self._emulator: EmulatedCamera | None = None
         size: Size = (None, None, None)
         if self._path is not None:
@@ -93,27 +82,27 @@ class RealSense(SdkCamera):
             self._emulator, self.first_number = EmulatedCamera(rs, emulated), FIRST_NUMBER
             self._device, self._owner = self._emulator.device, "the emulated camera"
         else:
-            self._device, size = sdk.find_camera(rs, serial), (width, height, fps)
+            self._device, size = _found(rs, serial), (width, height, fps)
         with reported_errors(f"{self._owner} cannot be used", self._remedy, RuntimeError):
-            self._streams = sdk.choose_streams(rs, self._device, size, infrared, self._owner)
+            chosen = choose_streams(rs, self._device, size, infrared, self._owner)
+            sensor, self._depth, self._infrared = chosen
             if preset is not None:
-                sdk.set_preset(rs, self._streams.sensor, preset)
-            own = self._streams.depth.as_video_stream_profile().get_intrinsics()
+                set_preset(rs, sensor, preset)
+            own = self._depth.as_video_stream_profile().get_intrinsics()
             self._set_up(
                 (own.width, own.height),
-                self._streams.depth.fps(),
+                self._depth.fps(),
                 keep == "newest" if bag is None else bool(realtime),
                 camera_file,
-                lambda: sdk.camera_of(rs, own),
+                lambda: camera_of(rs, own),
                 transport=transport if bag is None else "recording",
-                **sdk.facts(rs, self._device),
-                infrared=self._streams.infrared is not None,
+                **_facts(rs, self._device),
+                infrared=self._infrared is not None,
                 preset=preset,
                 realtime=bool(realtime),
             )
         self._realtime = bool(realtime)
-        self._asked: Callable[[], tuple[bool, Any]] | None = None
-        self._pipeline: Any = None
+        self._asked: Callable[[], tuple[bool, Any]]
         self._playback: Any = None
         if self._emulator is not None:
             self._describe_emulated(self._emulator, loop=emulated.loop)
@@ -130,70 +119,44 @@ class RealSense(SdkCamera):
         if store.truth is not None and self._capacity > 1:
             self.truth = store.truth[self._start : stop]
 
-    def open(self) -> None:
-        """Start the camera, or the recording; ToftrackError when it cannot be."""
-        if self._pipeline is not None:
-            return
+    def _run(self) -> None:
         rs, config = self._rs, self._rs.config()
-        pipeline = rs.pipeline()
+        pipeline = self._pipeline = rs.pipeline()
         if self._path is None:
             pipeline.set_device(self._device)
         else:
             config.enable_device_from_file(str(self._path), False)
-        for profile in filter(None, (self._streams.depth, self._streams.infrared)):
-            video = profile.as_video_stream_profile()
+        for profile in filter(None, (self._depth, self._infrared)):
             config.enable_stream(
                 profile.stream_type(),
                 profile.stream_index(),
-                video.width(),
-                video.height(),
+                *_size(profile)[:2],
                 profile.format(),
                 profile.fps(),
             )
-        if self._path is None:
-            self._open_camera(pipeline, config)
-        else:
-            self._open_recording(pipeline, config)
-
-    def _open_camera(self, pipeline: Any, config: Any) -> None:
+        if self._path is not None:
+            resolved = config.resolve(rs.pipeline_wrapper(pipeline))
+            self._playback = resolved.get_device().as_playback()
+            # Not at its own pace, the SDK waits for each frame to be taken.
+            self._playback.set_real_time(self._realtime)
+            pipeline.start(config)
+            self._asked = functools.partial(pipeline.try_wait_for_frames, _SLICE_MS)
+            return
         # The frames are kept, so that waiting ones do not use up the few that the SDK has.
-        queue = self._rs.frame_queue(self._capacity, True)
-        with reported_errors(
-            "the RealSense camera was found, but cannot be started", BUSY, RuntimeError
-        ):
-            pipeline.start(config, queue)
+        queue = rs.frame_queue(self._capacity, True)
+        pipeline.start(config, queue)
         if self._emulator is not None:
             waits = self._capacity > 1
             self._emulator.start(busy=lambda: waits and queue.size() >= self._capacity - 1)
         self._asked = functools.partial(queue.try_wait_for_frame, _SLICE_MS)
-        self._pipeline = pipeline
-
-    def _open_recording(self, pipeline: Any, config: Any) -> None:
-        rs = self._rs
-        with reported_errors(f"'{self._path}' cannot be replayed", OTHER_FILE, RuntimeError):
-            self._playback = (
-                config.resolve(rs.pipeline_wrapper(pipeline)).get_device().as_playback()
-            )
-            # Not at its own pace, the SDK waits for each frame to be taken.
-            self._playback.set_real_time(self._realtime)
-            pipeline.start(config)
-        self._asked = functools.partial(pipeline.try_wait_for_frames, _SLICE_MS)
-        self._pipeline = pipeline
 
     def close(self) -> None:
         """Stop the camera; a second call does nothing."""
-        pipeline, self._pipeline = self._pipeline, None
-        if pipeline is None:
-            return
-        if self._emulator is not None:
+        if self._running and self._emulator is not None:
             self._emulator.stop()
-        try:
-            pipeline.stop()
-        except RuntimeError as error:  # of a camera that is gone
-            _log.warning("realsense: %s", error)
+        super().close()
 
     def _take(self) -> Any | None:
-        assert self._asked is not None
         came, frames = self._asked()
         return frames.as_frameset() if came else None
 
@@ -221,3 +184,151 @@ class RealSense(SdkCamera):
             amplitude=np.asanyarray(infrared.get_data()).astype(np.uint16) if infrared else None,
             radial=False,
         )
+
+
+def load_sdk() -> ModuleType:
+    """The module pyrealsense2; ToftrackError when it is not installed or cannot be loaded."""
+    try:
+        return _imported()
+    except ImportError as error:
+        if "libusb" in str(error):
+            with contextlib.suppress(ImportError, OSError):
+                _preload_libusb()
+                return _imported()
+            raise ToftrackError(
+                "pyrealsense2 needs libusb-1.0, which is not installed: pip install "
+                "-e '.[realsense]' brings one, as does apt install libusb-1.0-0"
+            ) from error
+        raise ToftrackError(
+            f"device=realsense needs pyrealsense2 ({error}): pip install -e '.[realsense]'"
+        ) from error
+
+
+def _imported() -> ModuleType:
+    rs = importlib.import_module("pyrealsense2")
+    if not hasattr(rs, "pipeline") or not hasattr(rs.pipeline, "set_device"):
+        raise ImportError("the installed one is older than 2.56 or incomplete")
+    return rs
+
+
+def _preload_libusb() -> None:
+    # The wheels of pyrealsense2 leave libusb to the system; a loaded one of that name serves, too.
+    path = importlib.import_module("libusb_package").get_library_path()
+    ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
+
+
+def _found(rs: ModuleType, serial: str | int | None) -> Any:
+    """The plugged-in camera of that serial number, the only one for None; else ToftrackError."""
+    with reported_errors(
+        "the RealSense cameras cannot be listed", "unplug them and plug them in again", RuntimeError
+    ):
+        found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
+    otherwise = ", or try it without a camera with device.transport=emulated"
+    return found[chosen_serial(list(found), serial, "RealSense", otherwise)]
+
+
+def _facts(rs: ModuleType, device: Any) -> dict[str, Any]:
+    """What the camera says of itself, JSON-able."""
+    names = {"model": "name", "serial": "serial_number", "firmware": "firmware_version"}
+    return {key: _info(rs, device, name) for key, name in names.items()}
+
+
+def _info(rs: ModuleType, device: Any, name: str) -> str:
+    info = getattr(rs.camera_info, name)
+    return str(device.get_info(info)) if device.supports(info) else "unknown"
+
+
+def choose_streams(
+    rs: ModuleType, device: Any, size: Size, infrared: bool, owner: str
+) -> tuple[Any, Any, Any | None]:
+    """A device's depth sensor, and the profiles of its depth images and, if asked for and there, of
+    the infrared images on the same pixels.  size, owner, errors: as for `chosen_profile`.
+    """
+    sensor, profiles, offered = None, [], []
+    for sensor in device.query_sensors():
+        profiles = [p for p in sensor.get_stream_profiles() if p.is_video_stream_profile()]
+        if offered := _of_kind(profiles, rs.stream.depth, rs.format.z16):
+            break
+    depth = chosen_profile(offered, _size, size, owner)
+    return sensor, depth, _infrared_of(rs, profiles, depth) if infrared else None
+
+
+def _of_kind(profiles: list[Any], kind: Any, pixels: Any) -> list[Any]:
+    return [p for p in profiles if p.stream_type() == kind and p.format() == pixels]
+
+
+def _size(profile: Any) -> tuple[int, int, int]:
+    video = profile.as_video_stream_profile()
+    return video.width(), video.height(), profile.fps()
+
+
+def _infrared_of(rs: ModuleType, profiles: list[Any], depth: Any) -> Any | None:
+    # 8 bits first: the 16-bit images of stereo cameras are for calibration and not rectified. The
+    # left camera (number 1) first: the depth images lie on its pixels.
+    for wanted in (rs.format.y8, rs.format.y16):
+        fitting = [
+            p
+            for p in _of_kind(profiles, rs.stream.infrared, wanted)
+            if _size(p) == _size(depth) and p.stream_index() < 2
+        ]
+        if fitting:
+            return fitting[0]
+    return None
+
+
+def camera_of(rs: ModuleType, intrinsics: Any) -> Camera:
+    """A stream's intrinsics as a `Camera`.
+
+    OpenCV's distortion goes from the ideal to the measured pixel, as the SDK's own projection does.
+    Its Brown-Conrady model is OpenCV's; the modified and the inverse one differ in the tangential
+    part, so the coefficients are those that fit the SDK's projection best. ToftrackError where no
+    coefficients fit within half a pixel.
+    """
+    K = np.array(
+        [[intrinsics.fx, 0, intrinsics.ppx], [0, intrinsics.fy, intrinsics.ppy], [0, 0, 1.0]]
+    )
+    width, height = intrinsics.width, intrinsics.height
+    if not np.any(intrinsics.coeffs) or intrinsics.model == rs.distortion.none:
+        return Camera(K, width, height)
+    u, v = np.meshgrid(np.linspace(0, width - 1, 25), np.linspace(0, height - 1, 19))
+    x, y = (u.ravel() - K[0, 2]) / K[0, 0], (v.ravel() - K[1, 2]) / K[1, 1]
+    seen = [
+        rs.rs2_project_point_to_pixel(intrinsics, [a, b, 1.0]) for a, b in zip(x, y, strict=True)
+    ]
+    shift = np.array(seen) - np.stack((K[0, 0] * x + K[0, 2], K[1, 1] * y + K[1, 2]), axis=1)
+    # OpenCV's model is linear in its coefficients k1 k2 p1 p2 k3.
+    r2 = x * x + y * y
+    along_u = np.stack((x * r2, x * r2**2, 2 * x * y, r2 + 2 * x * x, x * r2**3), axis=1)
+    along_v = np.stack((y * r2, y * r2**2, r2 + 2 * y * y, 2 * x * y, y * r2**3), axis=1)
+    design = np.concatenate((K[0, 0] * along_u, K[1, 1] * along_v))
+    target = np.concatenate((shift[:, 0], shift[:, 1]))
+    distortion = np.linalg.lstsq(design, target, rcond=None)[0]
+    worst = float(np.abs(design @ distortion - target).max())
+    if not worst <= _WORST_FIT_PX:
+        raise ToftrackError(
+            f"the camera's lens model, {intrinsics.model}, is not one of OpenCV's (off by "
+            f"{worst:.1f} pixels); give a calibrated camera with camera.file=FILE"
+        )
+    return Camera(K, width, height, distortion)
+
+
+def set_preset(rs: ModuleType, sensor: Any, name: str) -> None:
+    """Choose one of the camera's own presets by its name, as `hand` or `high_accuracy`;
+    ToftrackError, with the names there are, for another one.
+    """
+    option, names = rs.option.visual_preset, {}
+    if sensor.supports(option):
+        limits = sensor.get_option_range(option)
+        for value in range(round(limits.min), round(limits.max) + 1):
+            text = sensor.get_option_value_description(option, value)
+            if text:
+                names[text.lower().replace(" ", "_")] = value
+    if name.lower() not in names:
+        raise ToftrackError(
+            f"the camera has no preset {name}; set device.preset to one of "
+            f"{', '.join(['null', *names])}"
+        )
+    with reported_errors(
+        f"the camera does not take the preset {name}", "set device.preset=null", RuntimeError
+    ):
+        sensor.set_option(option, names[name.lower()])

@@ -31,13 +31,9 @@ class EmulatorSettings:
     """What the virtual camera does; see conf/device/realsense.yaml."""
 
     source: str
-    """The recording that it sees: `sample`, or a file."""
     fps: float | None
-    """Frames a second; None = the recording's own."""
     loop: bool
-    """Begin again at the end; otherwise the stream ends there."""
     unit_m: float
-    """Metres of one step of the depth images."""
 
     def __post_init__(self) -> None:
         if (self.fps is not None and not self.fps > 0) or not self.unit_m > 0:
@@ -50,9 +46,8 @@ class EmulatorSettings:
 class EmulatedCamera:
     """The software device; `start` it when the pipeline runs, `stop` it before that ends.
 
-    Depth images are rectified Z: the SDK's cameras know no correction of the depth.
-
-    Raises ToftrackError when the recording cannot be used.
+    Depth images are rectified Z: the SDK's cameras know no correction of the depth. Raises
+    ToftrackError when the recording cannot be used.
     """
 
     def __init__(self, rs: ModuleType, settings: EmulatorSettings) -> None:
@@ -81,16 +76,13 @@ class EmulatedCamera:
         stream.type, stream.index, stream.uid, stream.fmt = kind, index, uid, pixel_format
         stream.width, stream.height, stream.bpp = camera.width, camera.height, 2
         stream.fps = max(1, round(self.fps))
-        stream.intrinsics = self._intrinsics()
-        return self._sensor.add_video_stream(stream, True).as_video_stream_profile()
-
-    def _intrinsics(self) -> Any:
-        camera, intrinsics = self.store.camera, self._rs.intrinsics()
+        intrinsics = self._rs.intrinsics()
         intrinsics.width, intrinsics.height = camera.width, camera.height
         intrinsics.fx, intrinsics.fy = float(camera.K[0, 0]), float(camera.K[1, 1])
         intrinsics.ppx, intrinsics.ppy = float(camera.K[0, 2]), float(camera.K[1, 2])
         intrinsics.model, intrinsics.coeffs = self._rs.distortion.none, [0.0] * 5
-        return intrinsics
+        stream.intrinsics = intrinsics
+        return self._sensor.add_video_stream(stream, True).as_video_stream_profile()
 
     def start(self, busy: Callable[[], bool]) -> None:
         """Begin with the first frame; hold the next one back while `busy` says so."""
@@ -102,7 +94,6 @@ class EmulatedCamera:
         self._thread.start()
 
     def stop(self) -> None:
-        """Send no more frames; a second call does nothing."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()

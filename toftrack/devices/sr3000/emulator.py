@@ -10,66 +10,198 @@ from __future__ import annotations
 import array
 import errno
 import os
+import re
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import usb.core
 from usb.backend import IBackend
 
-from toftrack.devices.sr3000 import descriptors
-from toftrack.devices.sr3000.descriptors import Descriptor
-from toftrack.devices.sr3000.faults import (
-    HARMLESS,
-    OPEN_FAULTS,
-    REQUEST_FAULTS,
-    Chunk,
-    EmulatorSettings,
-    parse_faults,
-    transfer,
-)
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
+from toftrack.errors import ToftrackError
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.sr_frame import REGISTERS, encode_frame, to_radial
+from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
 
+_PACKET_BYTES = 512
+"""Of a bulk endpoint at high speed."""
+_PACKETS = FRAME_BYTES // _PACKET_BYTES
 _TURN_S = 0.01  # how soon a waiting transfer notices that the camera was unplugged
-_CYCLE = tuple(kind for kind in REQUEST_FAULTS if kind != "late")
+
+_OPEN_FAULTS = {
+    "missing": "no camera is plugged in",
+    "permission": "the user may not open it",
+    "busy": "another program has claimed it",
+}
+"""Faults of the attempts to open the camera, numbered from 0."""
+
+_REQUEST_FAULTS = {
+    "timeout": "no frame comes",
+    "late": "the frame comes when nobody waits for it any more",
+    "refuse": "the request itself is stalled",
+    "stall": "the endpoint stalls until it is cleared",
+    "io_error": "an error of the bus",
+    "overflow": "more data in a packet than fit",
+    "short": "the frame ends in the middle of a packet",
+    "cut": "the frame ends behind a whole packet, without a word",
+    "empty": "a transfer of no bytes",
+    "long": "bytes behind the frame",
+    "split": "the frame comes in two transfers, cut behind a packet, a later one each time",
+    "garbage": "random bytes, as many as a frame has",
+    "zeros": "all 0",
+    "ones": "all 0xFFFF",
+    "unplug_before": "unplugged when the frame is asked for",
+    "unplug_during": "unplugged within the frame",
+    "unplug_after": "unplugged right behind the frame",
+}
+"""Faults of the requests for a frame, numbered from 0."""
+
+_CYCLE = tuple(kind for kind in _REQUEST_FAULTS if kind != "late")
+"""Of `fault_every`."""
+_HARMLESS = {"split", "garbage", "zeros", "ones", "unplug_after"}
+"""A whole frame comes nevertheless."""
+
+
+@dataclass(frozen=True)
+class _Fault:
+    """A fault of `count` attempts or requests in a row, the first of them number `first`."""
+
+    kind: str
+    first: int = 0
+    count: int | None = None
+    """None = all that follow."""
+
+    def hits(self, number: int) -> bool:
+        """Whether this attempt or request goes wrong."""
+        return self.first <= number and (self.count is None or number < self.first + self.count)
 
 
 @dataclass(eq=False)
-class _Handle:
-    camera: int
-    plugging: int
-    """Unplugging and plugging in again makes another device of the camera."""
-    claimed: bool = False
-    closed: bool = False
+class _Chunk:
+    """A piece of what waits at the bulk IN endpoint."""
+
+    ready_s: float
+    """On the monotonic clock."""
+    data: memoryview = memoryview(b"")
+    ends: bool = False
+    """The transfer ends behind it."""
+    error: int | None = None
+    """Instead of data: the errno of a failed transfer."""
+
+
+def _transfer(
+    fault: str | None, data: bytes, ready_s: float, split: int, random: np.random.Generator
+) -> list[_Chunk]:
+    """What comes over the wire for a frame at `ready_s`.
+
+    fault: one of _REQUEST_FAULTS under which something comes, or None.  split: how many frames came
+    in two transfers so far.  random: of the garbage.
+    """
+    whole = memoryview(data)
+    if fault == "overflow":
+        return [_Chunk(ready_s, error=errno.EOVERFLOW)]
+    if fault == "short":
+        return [_Chunk(ready_s, whole[:50_001], ends=True)]
+    if fault == "cut":
+        return [_Chunk(ready_s, whole[: 99 * _PACKET_BYTES])]
+    if fault == "empty":
+        return [_Chunk(ready_s, ends=True)]
+    if fault == "long":
+        return [_Chunk(ready_s, memoryview(data + b"\xa5" * 700), ends=True)]
+    if fault == "split":
+        at = (1 + split % (_PACKETS - 1)) * _PACKET_BYTES
+        return [_Chunk(ready_s, whole[:at], ends=True), _Chunk(ready_s, whole[at:])]
+    if fault in ("unplug_during", "unplug_after"):
+        came = whole[: 50 * _PACKET_BYTES] if fault == "unplug_during" else whole
+        return [_Chunk(ready_s, came), _Chunk(ready_s, error=errno.ENODEV)]
+    if fault == "garbage":
+        whole = memoryview(random.bytes(FRAME_BYTES))
+    elif fault in ("zeros", "ones"):
+        whole = memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES)
+    return [_Chunk(ready_s, whole)]
+
+
+def _parse_faults(texts: Iterable[str]) -> tuple[_Fault, ...]:
+    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on);
+    ToftrackError for an unknown kind or another form.
+    """
+    faults = []
+    for text in map(str, texts):
+        match = re.fullmatch(r"([a-z_]+)(?:@(\d+)(\+|x(\d+))?)?", text)
+        if match is None or match[1] not in _OPEN_FAULTS | _REQUEST_FAULTS:
+            raise ToftrackError(
+                f"device.emulated.faults: '{text}' is unknown; give KIND, KIND@7, KIND@7x3 or "
+                f"KIND@7+, where KIND is one of {', '.join(_OPEN_FAULTS | _REQUEST_FAULTS)}"
+            )
+        kind, first, rest, count = match.groups()
+        always = first is None or rest == "+"
+        faults.append(_Fault(kind, int(first or 0), None if always else int(count or 1)))
+    return tuple(faults)
+
+
+@dataclass(frozen=True)
+class EmulatorSettings:
+    """What the virtual camera does; see conf/device/sr3000.yaml."""
+
+    source: str
+    fps: float | None
+    loop: bool
+    faults: tuple[str, ...]
+    fault_every: int
+    replug_s: float
+    late_s: float
+    serials: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "faults", tuple(self.faults))
+        object.__setattr__(self, "serials", tuple(map(str, self.serials)))
+        _parse_faults(self.faults)
+        if (self.fps is not None and not self.fps > 0) or self.fault_every < 0:
+            raise ToftrackError(
+                "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
+                f"{self.fps} and {self.fault_every}"
+            )
 
 
 @dataclass(frozen=True)
 class _Id:
     camera: int
     plugging: int
+    """Unplugging and plugging in again makes another device of the camera."""
+
+
+@dataclass(eq=False)
+class _Handle:
+    device: _Id
+    claimed: bool = False
+    closed: bool = False
+
+
+class _Descriptor:
+    """A USB descriptor in the form that pyusb expects; fields that nobody states are 0."""
+
+    extra_descriptors = ()
+
+    def __init__(self, **fields: Any) -> None:
+        self.__dict__.update(fields)
+
+    def __getattr__(self, name: str) -> int:
+        return 0
 
 
 class EmulatedBackend(IBackend):
     """pyusb's view of a computer with virtual cameras plugged in.
 
-    Args:
-        source: what the cameras see; 176 x 144 pixels.
-        settings: how they behave.
-        range_m: their unambiguous range.
-        usb: ids, endpoints and the request that they answer.
+    source: what the cameras see, 176 x 144 pixels.  range_m: their unambiguous range.
+    usb: ids, endpoints and the request that they answer.
     """
 
     def __init__(
-        self,
-        source: FrameStore,
-        settings: EmulatorSettings,
-        range_m: float,
-        usb: UsbSettings,
+        self, source: FrameStore, settings: EmulatorSettings, range_m: float, usb: UsbSettings
     ) -> None:
         self.served = 0
         """Whole frames put at the endpoint, those of harmless faults included."""
@@ -80,10 +212,10 @@ class EmulatedBackend(IBackend):
         self.open_handles: set[_Handle] = set()
         self._source, self._settings, self._range_m = source, settings, range_m
         self._usb = usb
-        self._faults = parse_faults(settings.faults)
+        self._faults = _parse_faults(settings.faults)
         self._period_s = 1.0 / (settings.fps or source.fps)
         self._lock = threading.RLock()
-        self._queue: deque[Chunk] = deque()
+        self._queue: deque[_Chunk] = deque()
         self._stalled = False
         self._opens = self._position = self._splits = self._cycled = 0
         self._last_due_s = -np.inf
@@ -107,7 +239,6 @@ class EmulatedBackend(IBackend):
             self._stalled = False
 
     def plug_in(self) -> None:
-        """Plug the cameras in again."""
         with self._lock:
             self._back_s = 0.0
 
@@ -121,118 +252,120 @@ class EmulatedBackend(IBackend):
             serials = self._settings.serials if there else ()
             return iter([_Id(number, self._plugging) for number in range(len(serials))])
 
-    def get_device_descriptor(self, dev: _Id) -> Descriptor:
+    def get_device_descriptor(self, dev: _Id) -> _Descriptor:
         ids = self._usb.ids
         vendor, product = parse_id(ids[min(1, len(ids) - 1)])  # by default the usual SR3000
-        place = (dev.camera, 4 + dev.camera + 10 * dev.plugging)
-        return descriptors.device(vendor, product, *place)
+        return _Descriptor(
+            idVendor=vendor,
+            idProduct=product,
+            iSerialNumber=3,
+            bNumConfigurations=1,
+            bus=1,
+            address=4 + dev.camera + 10 * dev.plugging,
+            port_numbers=(1 + dev.camera,),
+        )
 
-    def get_configuration_descriptor(self, dev: _Id, config: int) -> Descriptor:
-        return descriptors.configuration(config)
+    def get_configuration_descriptor(self, dev: _Id, config: int) -> _Descriptor:
+        if config > 0:
+            raise IndexError(config)
+        return _Descriptor(bNumInterfaces=1, bConfigurationValue=1)
 
-    def get_interface_descriptor(self, dev: _Id, intf: int, alt: int, config: int) -> Descriptor:
-        return descriptors.interface(self._usb.interface, intf, alt, config)
+    def get_interface_descriptor(self, dev: _Id, intf: int, alt: int, config: int) -> _Descriptor:
+        if intf > 0 or alt > 0:
+            raise IndexError((intf, alt))
+        return _Descriptor(bInterfaceNumber=self._usb.interface, bNumEndpoints=2)
 
     def get_endpoint_descriptor(
         self, dev: _Id, ep: int, intf: int, alt: int, config: int
-    ) -> Descriptor:
-        return descriptors.endpoint((self._usb.endpoint_in, self._usb.endpoint_out)[ep])
+    ) -> _Descriptor:
+        address = (self._usb.endpoint_in, self._usb.endpoint_out)[ep]
+        return _Descriptor(bEndpointAddress=address, bmAttributes=2, wMaxPacketSize=_PACKET_BYTES)
 
     def open_device(self, dev: _Id) -> _Handle:
         with self._lock:
-            if not self._plugged() or dev.plugging != self._plugging:
-                raise _error(errno.ENODEV)
+            self._check_plugged(dev)
             if self._open_fault() == "permission":
                 self._opens += 1
                 raise _error(errno.EACCES)
-            handle = _Handle(dev.camera, dev.plugging)
+            handle = _Handle(dev)
             self.open_handles.add(handle)
             return handle
 
-    def close_device(self, dev_handle: _Handle) -> None:
+    def close_device(self, handle: _Handle) -> None:
         with self._lock:
-            if dev_handle.closed:
+            if handle.closed:
                 self.misuse.append("a handle was closed twice")
-            if dev_handle.claimed and dev_handle.plugging == self._plugging:
+            if handle.claimed and handle.device.plugging == self._plugging:
                 self.misuse.append("a handle was closed with its interface claimed")
-            dev_handle.closed, dev_handle.claimed = True, False
-            self.open_handles.discard(dev_handle)
+            handle.closed, handle.claimed = True, False
+            self.open_handles.discard(handle)
 
-    def get_configuration(self, dev_handle: _Handle) -> int:
+    def get_configuration(self, handle: _Handle) -> int:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
             return 1
 
-    def set_configuration(self, dev_handle: _Handle, config_value: int) -> None:
+    def set_configuration(self, handle: _Handle, config_value: int) -> None:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
 
-    def claim_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def claim_interface(self, handle: _Handle, intf: int) -> None:
         with self._lock:
-            self._check(dev_handle, claimed=False)
+            self._check(handle, claimed=False)
             fault = self._open_fault()
             self._opens += 1
             if fault == "busy":
                 raise _error(errno.EBUSY)
-            dev_handle.claimed = True
+            handle.claimed = True
 
-    def release_interface(self, dev_handle: _Handle, intf: int) -> None:
+    def release_interface(self, handle: _Handle, intf: int) -> None:
         with self._lock:
-            dev_handle.claimed = False
-            self._check(dev_handle, claimed=False)
+            handle.claimed = False
+            self._check(handle, claimed=False)
 
-    def is_kernel_driver_active(self, dev_handle: _Handle, intf: int) -> bool:
+    def is_kernel_driver_active(self, handle: _Handle, intf: int) -> bool:
         return False
 
-    def clear_halt(self, dev_handle: _Handle, ep: int) -> None:
+    def clear_halt(self, handle: _Handle, ep: int) -> None:
         with self._lock:
-            self._check(dev_handle)
+            self._check(handle)
             self._stalled = False
 
     def ctrl_transfer(
-        self,
-        dev_handle: _Handle,
-        bmRequestType: int,  # noqa: N803
-        bRequest: int,  # noqa: N803
-        wValue: int,  # noqa: N803
-        wIndex: int,  # noqa: N803
-        data: array.array,
-        timeout: int,
+        self, handle: _Handle, kind: int, request: int, value: int, index: int, data: Any, _: int
     ) -> int:
         with self._lock:
-            self._check(dev_handle, claimed=False)
-            if (bmRequestType, bRequest, wValue >> 8) == (0x80, 6, 3):
-                return descriptors.string(
-                    data, wValue & 0xFF, self._settings.serials[dev_handle.camera]
-                )
-            usb_ = self._usb
-            expected = (usb_.request_type, usb_.request, usb_.request_value, usb_.request_index)
-            if (bmRequestType, bRequest, wValue, wIndex) != expected:
+            self._check(handle, claimed=False)
+            if (kind, request, value >> 8) == (0x80, 6, 3):
+                # A string: number 0 is the list of languages, another one the serial number.
+                serial = self._settings.serials[handle.device.camera].encode("utf-16-le")
+                text = serial if value & 0xFF else (0x0409).to_bytes(2, "little")
+                content = (bytes((2 + len(text), 3)) + text)[: len(data)]
+                data[: len(content)] = array.array("B", content)
+                return len(content)
+            known = self._usb
+            expected = (known.request_type, known.request, known.request_value, known.request_index)
+            if (kind, request, value, index) != expected:
                 raise _error(errno.EPIPE)
-            self._check(dev_handle)
+            self._check(handle)
             if any(chunk.error == errno.ENODEV for chunk in self._queue):
-                self.unplug(self._settings.replug_s)
-                raise _error(errno.ENODEV)
+                raise self._unplugged()
             self._request()
             return 0
 
-    def bulk_write(
-        self, dev_handle: _Handle, ep: int, intf: int, data: array.array, timeout: int
-    ) -> int:
+    def bulk_write(self, handle: _Handle, ep: int, intf: int, data: Any, timeout: int) -> int:
         with self._lock:
-            self._check(dev_handle)
+            self._check(handle)
             if ep != self._usb.endpoint_out or len(data) != 2 or data[0] >= REGISTERS:
                 raise _error(errno.EPIPE)
             self.registers[data[0]] = data[1]
             return 2
 
-    def bulk_read(
-        self, dev_handle: _Handle, ep: int, intf: int, buff: array.array, timeout: int
-    ) -> int:
+    def bulk_read(self, handle: _Handle, ep: int, intf: int, buff: Any, timeout: int) -> int:
         deadline, target, count = time.monotonic() + timeout / 1000, memoryview(buff), 0
         while True:
             with self._lock:
-                self._check(dev_handle)
+                self._check(handle)
                 if self._stalled:
                     raise _error(errno.EPIPE)
                 now = time.monotonic()
@@ -262,36 +395,45 @@ class EmulatedBackend(IBackend):
     def _plugged(self) -> bool:
         return self._back_s is not None and time.monotonic() >= self._back_s
 
+    def _check_plugged(self, device: _Id) -> None:
+        if device.plugging != self._plugging or not self._plugged():
+            raise _error(errno.ENODEV)
+
     def _check(self, handle: _Handle, claimed: bool = True) -> None:
         if handle.closed:
             self.misuse.append("a closed handle was used")
             raise _error(errno.EINVAL)
-        if handle.plugging != self._plugging or not self._plugged():
-            raise _error(errno.ENODEV)
+        self._check_plugged(handle.device)
         if claimed and not handle.claimed:
             self.misuse.append("an interface was used without being claimed")
             raise _error(errno.EINVAL)
 
-    def _open_fault(self) -> str | None:
-        hit = (f.kind for f in self._faults if f.kind in OPEN_FAULTS and f.hits(self._opens))
+    def _fault(self, kinds: Collection[str], number: int) -> str | None:
+        """The first fault of some kinds that hits an attempt or request."""
+        hit = (f.kind for f in self._faults if f.kind in kinds and f.hits(number))
         return next(hit, None)
+
+    def _open_fault(self) -> str | None:
+        return self._fault(_OPEN_FAULTS, self._opens)
 
     def _fail(self, number: int) -> None:
         self._queue.popleft()
         if number == errno.ENODEV:
-            self.unplug(self._settings.replug_s)
+            raise self._unplugged()
         self._stalled = number == errno.EPIPE
         raise _error(number)
 
+    def _unplugged(self) -> usb.core.USBError:
+        self.unplug(self._settings.replug_s)
+        return _error(errno.ENODEV)
+
     def _request_fault(self) -> str | None:
-        number = self.requests
         every = self._settings.fault_every
-        if every and (number + 1) % every == 0:
+        if every and (self.requests + 1) % every == 0:
             kind = _CYCLE[self._cycled % len(_CYCLE)]
             self._cycled += 1
             return kind
-        hit = (f.kind for f in self._faults if f.kind in REQUEST_FAULTS and f.hits(number))
-        return next(hit, None)
+        return self._fault(_REQUEST_FAULTS, self.requests)
 
     def _request(self) -> None:
         fault = self._request_fault()
@@ -302,11 +444,10 @@ class EmulatedBackend(IBackend):
             return
         if fault == "unplug_before":
             self._position += 1  # the scene goes on
-            self.unplug(self._settings.replug_s)
-            raise _error(errno.ENODEV)
+            raise self._unplugged()
         if fault in ("stall", "io_error"):
             number = errno.EPIPE if fault == "stall" else errno.EIO
-            self._queue.append(Chunk(0.0, error=number))
+            self._queue.append(_Chunk(0.0, error=number))
             return
         data = self._next_frame()
         if data is None:
@@ -315,11 +456,11 @@ class EmulatedBackend(IBackend):
         self._last_due_s = due
         if fault == "late":
             due += self._settings.late_s
-        if fault is None or fault in HARMLESS:
+        if fault is None or fault in _HARMLESS:
             self.served += 1
         if fault == "unplug_after":
             self._position += 1  # the scene goes on
-        self._queue.extend(transfer(fault, data, due, self._splits, self._random))
+        self._queue.extend(_transfer(fault, data, due, self._splits, self._random))
         self._splits += fault == "split"
 
     def _next_frame(self) -> bytes | None:
@@ -330,9 +471,8 @@ class EmulatedBackend(IBackend):
             return None
         depth, amplitude = source.image(self._position)
         self._position += 1
-        return encode_frame(
-            to_radial(depth, source.radial, source.camera), amplitude, self._range_m
-        )
+        radial_m = to_radial(depth, source.radial, source.camera)
+        return encode_frame(radial_m, amplitude, self._range_m)
 
 
 def _error(number: int) -> usb.core.USBError:

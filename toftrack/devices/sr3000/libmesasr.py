@@ -29,15 +29,9 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 
 
 class MesaTransport:
-    """One camera, opened and read by the vendor's library.
+    """One camera, opened and read by the vendor's library; exposure: set when it is opened.
 
-    Args:
-        settings: the library and its mode.
-        exposure: set when the camera is opened.
-        serial: the camera's serial number, a number in decimal or 0x..; None = the first camera.
-
-    Raises:
-        ToftrackError: the serial number is no number.
+    serial: a number in decimal or 0x..; None = the first camera. ToftrackError where it is none.
     """
 
     def __init__(
@@ -50,11 +44,9 @@ class MesaTransport:
         self.patience_s = settings.timeout_ms / 1000
 
     def check(self) -> None:
-        """Load the library. Raises ToftrackError when it is not there."""
         self._library = self._library or _load(self._settings.library)
 
     def open(self) -> None:
-        """Load the library and open the camera. Raises ToftrackError when either fails."""
         self.close()
         self.check()
         library = self._library
@@ -76,7 +68,6 @@ class MesaTransport:
             raise
 
     def acquire(self) -> bytes:
-        """One frame, FRAME_BYTES bytes; the faults are those of `Transport.acquire`."""
         library, camera = self._library, self._camera
         if library is None or camera is None:
             raise UnpluggedError("it is not open")
@@ -89,13 +80,11 @@ class MesaTransport:
         return b"".join(ctypes.string_at(image, IMAGE_BYTES) for image in images)
 
     def close(self) -> None:
-        """Close the camera; a second call does nothing."""
         camera, self._camera = self._camera, None
         if camera is not None and self._library is not None:
             self._library.SR_Close(camera)
 
     def facts(self) -> dict[str, Any]:
-        """The library in use."""
         return {"library": self._settings.library, "serial": self._serial or None}
 
     def _configure(self, library: ctypes.CDLL, camera: ctypes.c_void_p) -> None:

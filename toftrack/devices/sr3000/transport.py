@@ -1,4 +1,9 @@
-"""What the ways to an SR3000 have in common: their face, their faults and their settings.
+"""What the ways to an SR3000 have in common: their faults and their settings.
+
+A way has `check` (ToftrackError where it is plain, without opening it, that there is no camera),
+`open` (ToftrackError where none can be found, claimed and configured), `acquire` (the FRAME_BYTES
+bytes of a frame, or one of the faults below, within `patience_s`), `close`, which never raises, and
+`facts` of the opened camera. Only one thread uses it at a time.
 
 Every number below is a setting, because some of them were never tried against a camera: see
 `conf/device/sr3000.yaml` for each one's unit and source.
@@ -8,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
 
 from toftrack.checks import check_number
 from toftrack.errors import ToftrackError
@@ -35,47 +39,13 @@ class EndOfStreamError(Exception):
     """There are no more frames (only an emulated camera's recording ends)."""
 
 
-class Transport(Protocol):
-    """A way to the camera. Only one thread uses it at a time."""
-
-    patience_s: float
-    """How long a call of `acquire` may take."""
-
-    def check(self) -> None:
-        """Raises ToftrackError when it is plain, without opening it, that there is no camera."""
-        ...
-
-    def open(self) -> None:
-        """Find, claim and configure the camera. Raises ToftrackError when that cannot be done."""
-        ...
-
-    def acquire(self) -> bytes:
-        """Ask for one frame and wait for its FRAME_BYTES bytes.
-
-        Raises NoAnswerError, DamagedFrameError or UnpluggedError for what may pass, and
-        EndOfStreamError at the end.
-        """
-        ...
-
-    def close(self) -> None:
-        """Let go of the camera; never raises, and a second call does nothing."""
-        ...
-
-    def facts(self) -> dict[str, Any]:
-        """What is known of the opened camera, JSON-able."""
-        ...
-
-
 @dataclass(frozen=True)
 class Exposure:
-    """How the camera is to take its images."""
+    """How the camera is to take its images; see conf/device/sr3000.yaml."""
 
     modulation_mhz: int
-    """40, 30, 21, 20 or 19; gives the unambiguous range."""
     integration_time: int | None
-    """0..255, (n + 1) x 0.2 ms; None leaves the camera's own."""
     amplitude_threshold: int
-    """Pixels of a smaller amplitude have no distance; 0 keeps all."""
 
     def __post_init__(self) -> None:
         unambiguous_range_m(self.modulation_mhz)
@@ -85,12 +55,10 @@ class Exposure:
 
     @property
     def range_m(self) -> float:
-        """The unambiguous range, metres."""
         return unambiguous_range_m(self.modulation_mhz)
 
     @property
     def modulation_code(self) -> int:
-        """The vendor's code of the modulation frequency."""
         return MODULATION_CODES[self.modulation_mhz]
 
 
@@ -111,7 +79,6 @@ class UsbSettings:
     drain_ms: int
     tail_check_ms: int
     registers: Mapping[int, int]
-    """Raw writes when the camera is opened: address to value."""
     integration_time_register: int | None
     modulation_register: int | None
 
@@ -152,11 +119,10 @@ class UsbSettings:
 
 @dataclass(frozen=True)
 class MesaSettings:
-    """The vendor's library."""
+    """The vendor's library; see conf/device/sr3000.yaml."""
 
     library: str
     mode: int
-    """0x01 fixed-pattern correction + 0x04 median of 3x3, as the vendor proposes."""
     timeout_ms: int
 
     def __post_init__(self) -> None:
@@ -166,24 +132,19 @@ class MesaSettings:
 
 @dataclass(frozen=True)
 class Persistence:
-    """How long to go on trying."""
+    """How long to go on trying; see conf/device/sr3000.yaml."""
 
     first_frame_s: float
-    """A camera that was opened but has sent nothing for so long does not answer."""
     give_up_s: float | None
-    """The same later on, and for an unplugged camera to come back; None = for ever."""
+    """None = for ever."""
     backoff_s: float
-    """Before the first attempt to open an unplugged camera again; doubles from one to the next."""
     longest_backoff_s: float
     reopen_after: int
-    """So many faults in a row, and the camera is closed and opened again."""
 
     def __post_init__(self) -> None:
         for name in ("first_frame_s", "give_up_s", "backoff_s", "longest_backoff_s"):
-            value = getattr(self, name)
-            if value is None and name == "give_up_s":
-                continue
-            check_number(f"device.persistence.{name}", value, 0, above=True)
+            if name != "give_up_s" or self.give_up_s is not None:
+                check_number(f"device.persistence.{name}", getattr(self, name), 0, above=True)
         check_number("device.persistence.reopen_after", self.reopen_after, 1, 1_000_000, whole=True)
 
 

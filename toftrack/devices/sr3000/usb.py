@@ -11,7 +11,7 @@ import array
 import contextlib
 import errno
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import usb.core
@@ -27,13 +27,16 @@ from toftrack.devices.sr3000.transport import (
     UsbSettings,
     parse_id,
 )
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.recordings.sr_frame import FRAME_BYTES
 
-WHEN_IT_DOES_NOT_ANSWER = (
-    "open the camera once with the vendor's viewer (its library loads the camera's firmware), use "
-    "that library with device.transport=libmesasr, or try without a camera with "
+_OTHERWISE = (
+    "use the vendor's library with device.transport=libmesasr, or try without a camera with "
     "device.transport=emulated"
+)
+WHEN_IT_DOES_NOT_ANSWER = (
+    "open the camera once with the vendor's viewer (its library loads the camera's firmware), "
+    + _OTHERWISE
 )
 # Of what a camera can leave behind, nothing is longer than a few frames.
 _LARGEST_DRAIN = 8 * FRAME_BYTES
@@ -44,12 +47,8 @@ class UsbTransport:
 
     The camera is never reset: whether its firmware would survive that is not known.
 
-    Args:
-        settings: the USB interface.
-        exposure: written to the camera where the settings say to which registers.
-        serial: the camera's serial number; None = the only one.
-        backend: of pyusb; None = libusb.
-        ended: says that there will be no more frames.
+    exposure: written to the camera where the settings say to which registers.  serial: None = the
+    only camera.  backend: of pyusb; None = libusb.
     """
 
     def __init__(
@@ -58,26 +57,17 @@ class UsbTransport:
         exposure: Exposure,
         serial: str | None = None,
         backend: IBackend | None = None,
-        ended: Callable[[], bool] | None = None,
     ) -> None:
         self._settings, self._exposure = settings, exposure
-        self._serial = serial
-        self._backend = backend
-        self._ended = ended
+        self._serial, self._backend = serial, backend
         self._device: Any = None  # a usb.core.Device while it is open
         self._length = -(-FRAME_BYTES // settings.read_multiple) * settings.read_multiple
         self.patience_s = (3 * settings.timeout_ms + settings.drain_ms) / 1000
 
     def check(self) -> None:
-        """Look whether there is one camera to open. Raises ToftrackError if not."""
         _let_go([self._find()])
 
     def open(self) -> None:
-        """Find, claim and configure the camera.
-
-        Raises ToftrackError when there is none (or several, and none was chosen), when it may not
-        be opened, when another program has it, or when it does not take its settings.
-        """
         self.close()
         self._device = self._find()
         try:
@@ -94,21 +84,15 @@ class UsbTransport:
             raise
 
     def acquire(self) -> bytes:
-        """One frame, FRAME_BYTES bytes; the faults are those of `Transport.acquire`."""
-        if self._ended is not None and self._ended():
+        if getattr(self._backend, "ended", False):  # an emulated camera's
             raise EndOfStreamError
         if self._device is None:
             raise UnpluggedError("it is not open")
         settings = self._settings
         try:
-            self._device.ctrl_transfer(
-                settings.request_type,
-                settings.request,
-                settings.request_value,
-                settings.request_index,
-                None,
-                settings.timeout_ms,
-            )
+            what = settings.request_type, settings.request
+            place = settings.request_value, settings.request_index
+            self._device.ctrl_transfer(*what, *place, None, settings.timeout_ms)
             data = self._read_frame(self._device)
         except usb.core.USBError as error:
             raise self._recovered(error) from error
@@ -118,7 +102,6 @@ class UsbTransport:
         return data
 
     def close(self) -> None:
-        """Release the interface and the handle; never raises."""
         device, self._device = self._device, None
         if device is None:
             return
@@ -128,7 +111,6 @@ class UsbTransport:
         _let_go([device])
 
     def facts(self) -> dict[str, Any]:
-        """Ids, place and serial number of the opened camera."""
         device = self._device
         if device is None:
             return {}
@@ -141,38 +123,33 @@ class UsbTransport:
     def _find(self) -> usb.core.Device:
         ids = {parse_id(text) for text in self._settings.ids}
         names = ", ".join(self._settings.ids)
+        what = f"the USB devices cannot be listed to find an SR3000 ({names})"
+        remedy = f"check that this user may use USB, {_OTHERWISE}"
         try:
-            found = list(
-                usb.core.find(
-                    find_all=True,
-                    backend=self._backend,
-                    custom_match=lambda device: (device.idVendor, device.idProduct) in ids,
+            with reported_errors(what, remedy, usb.core.USBError):
+                found = list(
+                    usb.core.find(
+                        find_all=True,
+                        backend=self._backend,
+                        custom_match=lambda device: (device.idVendor, device.idProduct) in ids,
+                    )
                 )
-            )
         except usb.core.NoBackendError:
             raise ToftrackError(
                 f"no SR3000 can be looked for on USB (ids {names}), because the library "
                 "libusb-1.0 is not installed: install it (Debian, Ubuntu: apt install "
-                "libusb-1.0-0), use the vendor's library with device.transport=libmesasr, or try "
-                "without a camera with device.transport=emulated"
+                f"libusb-1.0-0), {_OTHERWISE}"
             ) from None
-        except usb.core.USBError as error:
-            raise ToftrackError(
-                f"the USB devices cannot be listed to find an SR3000 ({names}): {error}; "
-                "check that this user may use USB, or try without a camera with "
-                "device.transport=emulated"
-            ) from error
+        wanted = ""
         if self._serial is not None:
+            wanted = f" with the serial number {self._serial}"
             chosen = [device for device in found if _serial_number(device) == self._serial]
             _let_go(device for device in found if device not in chosen)
             found = chosen
         if not found:
-            wanted = "" if self._serial is None else f" with the serial number {self._serial}"
             raise ToftrackError(
                 f"no SR3000{wanted} was found on USB (looked for the ids {names}): plug it in "
-                "and switch it on (lsusb must list it), use the vendor's library with "
-                "device.transport=libmesasr, or try without a camera with "
-                "device.transport=emulated"
+                f"and switch it on (lsusb must list it), {_OTHERWISE}"
             )
         if len(found) > 1:
             numbers = ", ".join(_serial_number(device) or "unreadable" for device in found)
@@ -201,17 +178,15 @@ class UsbTransport:
             raise _unopened(error) from error
 
     def _check_endpoints(self, device: usb.core.Device) -> None:
-        settings = self._settings
         there = {
             endpoint.bEndpointAddress
             for interface in device.get_active_configuration()
-            if interface.bInterfaceNumber == settings.interface
+            if interface.bInterfaceNumber == self._settings.interface
             for endpoint in interface
         }
-        needed = {"endpoint_in": settings.endpoint_in}
-        if settings.register_writes(self._exposure):
-            needed["endpoint_out"] = settings.endpoint_out
-        for name, address in needed.items():
+        writes = self._settings.register_writes(self._exposure)
+        for name in ("endpoint_in", "endpoint_out") if writes else ("endpoint_in",):
+            address = getattr(self._settings, name)
             if address not in there:
                 listed = ", ".join(f"{address:#04x}" for address in sorted(there)) or "none"
                 raise ToftrackError(
@@ -220,14 +195,11 @@ class UsbTransport:
                 )
 
     def _write_register(self, address: int, value: int) -> None:
-        settings = self._settings
-        try:
-            self._device.write(settings.endpoint_out, bytes((address, value)), settings.timeout_ms)
-        except usb.core.USBError as error:
-            raise ToftrackError(
-                f"the camera does not take the value {value} for its register {address} "
-                f"({_reason(error)}); check device.usb.registers, or leave them out"
-            ) from error
+        endpoint, timeout_ms = self._settings.endpoint_out, self._settings.timeout_ms
+        what = f"the camera does not take the value {value} for its register {address}"
+        remedy = "check device.usb.registers, or leave them out"
+        with reported_errors(what, remedy, usb.core.USBError):
+            self._device.write(endpoint, bytes((address, value)), timeout_ms)
 
     def _read_frame(self, device: usb.core.Device) -> bytes:
         """All of one frame, or as much as came of it; more than a frame when more came."""
@@ -249,10 +221,9 @@ class UsbTransport:
         if count == self._length and settings.tail_check_ms:
             # Without a look behind the frame, what is too long would shift all frames after it.
             # Whatever goes wrong here, the frame itself has come as a whole.
+            asked = device, settings.endpoint_in, self._length, settings.tail_check_ms
             with contextlib.suppress(usb.core.USBError):
-                parts.append(
-                    _read(device, settings.endpoint_in, self._length, settings.tail_check_ms)
-                )
+                parts.append(_read(*asked))
         data = b"".join(parts)
         return data[:FRAME_BYTES] if len(data) == self._length else data
 
@@ -320,17 +291,17 @@ def _reason(error: usb.core.USBError) -> str:
 
 
 def _unopened(error: usb.core.USBError) -> ToftrackError:
+    what = "the SR3000 was found, but"
     if error.errno in (errno.EACCES, errno.EPERM):
         return ToftrackError(
-            "the SR3000 was found, but this user may not open it: install the udev rule of "
-            "docs/cameras.md, then unplug the camera and plug it in again (or, to try, run as root)"
+            f"{what} this user may not open it: install the udev rule of docs/cameras.md, then "
+            "unplug the camera and plug it in again (or, to try, run as root)"
         )
     if error.errno == errno.EBUSY:
         return ToftrackError(
-            "the SR3000 is in use by another program; close that (the vendor's viewer, another "
+            f"{what} is in use by another program; close that (the vendor's viewer, another "
             "track.py), then start again"
         )
     return ToftrackError(
-        f"the SR3000 was found, but cannot be opened ({_reason(error)}): unplug it, wait a moment "
-        "and plug it in again"
+        f"{what} cannot be opened ({_reason(error)}): unplug it, wait a moment and plug it in again"
     )
