@@ -12,9 +12,7 @@ What clients send is read and thrown away; who may listen, server.py says.
 
 from __future__ import annotations
 
-import asyncio
 import sys
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, Self
 
@@ -22,7 +20,7 @@ from toftrack.checks import check_number
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
 from toftrack.output.stream import Stream, known_fields, report_dropped
-from toftrack.output.web.server import ANY_PORT, WebServer
+from toftrack.output.web.server import ANY_PORT, Client, WebServer
 
 STREAM = "/stream"
 _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
@@ -88,28 +86,19 @@ class WebSocketStream(Stream):
             client.offer(line)
 
 
-class _Listener:
-    """Lines that wait for one client."""
-
+class _Listener(Client):
     def __init__(self, stream: WebSocketStream, waiting: int) -> None:
+        super().__init__(waiting)
         self._stream = stream
-        self._lines: deque[str] = deque(maxlen=waiting)
-        self.news = asyncio.Event()
 
     def offer(self, line: str) -> None:
         """Keep a line, in place of the oldest where there are too many."""
-        self._stream.dropped += len(self._lines) == self._lines.maxlen
-        self._lines.append(line)
+        if len(self) == self._most_waiting:
+            self._messages.popleft()
+            self._stream.dropped += 1
+        self._messages.append(line)
         self.news.set()
 
-    def take(self) -> str | None:
-        if not self._lines:
-            return None
-        self._stream.sent += 1
-        return self._lines.popleft()
-
-    def receive(self, message: str | bytes) -> None:
-        """Nobody looks at it."""
-
-    def __len__(self) -> int:
-        return len(self._lines)
+    def take(self) -> str | bytes | None:
+        self._stream.sent += bool(self)
+        return super().take()
