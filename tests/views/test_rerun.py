@@ -20,7 +20,7 @@ from helpers.moments import one_hand, two_hands, with_hand
 from helpers.tracking import configuration, make_tracker
 from hydra.utils import instantiate
 
-import toftrack.views.rerun
+import toftrack.views
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.sample import Sample
 from toftrack.errors import ToftrackError
@@ -33,9 +33,9 @@ FRAMES = 6
 
 def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for name in ("view", "entities"):  # another test may have imported them
-        monkeypatch.delitem(sys.modules, f"toftrack.views.rerun.{name}", raising=False)
-        monkeypatch.delattr(toftrack.views.rerun, name, raising=False)
+    # Another test may have imported it.
+    monkeypatch.delitem(sys.modules, "toftrack.views.rerun", raising=False)
+    monkeypatch.delattr(toftrack.views, "rerun", raising=False)
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
     assert "needs the package rerun-sdk" in sentence(error.value)
@@ -52,7 +52,7 @@ def test_other_views_import_neither_rerun_nor_matplotlib() -> None:
 def rerun_view():
     """The module, where rerun-sdk is installed."""
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install -e '.[rerun]')")
-    from toftrack.views.rerun import view as rerun_view
+    from toftrack.views import rerun as rerun_view
 
     return rerun_view
 
