@@ -14,7 +14,7 @@ from __future__ import annotations
 import itertools
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -27,7 +27,6 @@ from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_PARENTS
 from toftrack.output.lines import (
     FRAME_FIELDS,
-    FROM_THE_START,
     HAND_FIELDS,
     KINDS,
     SHAPES,
@@ -46,9 +45,8 @@ _SOON_S = 2.0
 class Records:
     """The frames of a run, for a `with`; each field is a column.
 
-    folder: exists; where the records are kept, under no name.
-    like: what a line says of a hand, or of a frame of one; tells the fields and their shapes.
-    slots: of each frame; of several, a line has `hands`.
+    They are kept in the folder, under no name. like: what a line says of a hand, or of a frame of
+    one; tells the shapes.  slots: of each frame; of several, a line has `hands`.
 
     Raises OSError (by `append`, too) when the records cannot be kept there.
     """
@@ -58,14 +56,18 @@ class Records:
         self._words: dict[str, int] = {}
         self._vacant = _vacant(like)
         frame = dict.fromkeys(FRAME_FIELDS, 0)
-        self._kind = _record_kind(like if slots == 1 else self._side_by_side(frame | {"hands": []}))
+        line = like if slots == 1 else self._side_by_side(frame | {"hands": []})
+        self._kind = np.dtype(  # texts are numbers of words
+            [
+                (name, np.int32 if kind is np.str_ else kind, np.shape(line[name]))
+                for name, kind in KINDS.items()
+            ]
+        )
         self._file: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
 
     @classmethod
-    def of_lines(cls, lines: Path, latent_size: int = 4, slots: int = 1) -> Records:
-        """The records of a track.jsonl, which is read at once.
-
-        latent_size: of the columns of a file without a hand.  slots: of the run.
+    def of_lines(cls, lines: Path, latent_size: int, slots: int) -> Records:
+        """The records of a track.jsonl, which is read at once; latent_size is for one without hand.
 
         Raises ToftrackError for a damaged line, OSError when the lines cannot be read.
         """
@@ -77,7 +79,7 @@ class Records:
         last = 1
         try:
             like = like or no_estimate(0, 0, "", latent_size, 0).values()
-            _check(like, set(FROM_THE_START) - set(FRAME_FIELDS if slots > 1 else ()))
+            _check(like, HAND_FIELDS if slots > 1 else tuple(KINDS))
             records = cls(lines.parent, like, slots)
             try:
                 read = read_lines(lines)
@@ -111,18 +113,11 @@ class Records:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the columns."""
-        return self._kind.names or ()
-
     def column(self, name: str, rows: np.ndarray | None = None) -> np.ndarray:
         """A whole column, or its rows (not decreasing); texts as texts."""
         rows = np.arange(self.count) if rows is None else rows
-        kind = self.kind(name)
-        pieces = [piece for piece in self.pieces(name, rows)]
-        shape = self._kind[name].shape
-        return np.concatenate(pieces) if pieces else np.zeros((0, *shape), kind)
+        nothing = np.zeros((0, *self.shape(name)), self.kind(name))
+        return np.concatenate((nothing, *self.pieces(name, rows)))
 
     def pieces(self, name: str, rows: np.ndarray) -> Iterator[np.ndarray]:
         """Some rows (not decreasing) of a column, in pieces."""
@@ -153,7 +148,7 @@ class Records:
         if self.slots > 1:
             lines = [self._side_by_side(line) for line in lines]
         records = np.zeros(len(lines), self._kind)
-        for name in self.names:
+        for name in KINDS:
             values = [line[name] for line in lines]
             if KINDS[name] is np.str_:
                 values = [self._number(word) for word in values]
@@ -161,7 +156,7 @@ class Records:
                 array = np.array(values, self._kind[name].base)
             if array.dtype.kind == "f":
                 array[np.isinf(array)] = np.nan  # as in the lines
-            records[name] = array.reshape(len(lines), *self._kind[name].shape)
+            records[name] = array.reshape(len(lines), *self.shape(name))
         self._file.write(records.tobytes())
         self.count += len(lines)
 
@@ -180,15 +175,14 @@ class Records:
         return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
 
 
-def _check(hand: Mapping[str, Any], needed: Set[str]) -> None:
+def _check(hand: Mapping[str, Any], needed: Sequence[str]) -> None:
     """ValueError where what a line says of a hand lacks a field, or has one of another shape."""
-    for name in KINDS:
-        if name in hand:
-            shape = np.shape(hand[name])
-            if shape != SHAPES.get(name, shape):
-                raise ValueError(f"{name!r} has the shape {shape}")
-        elif name in needed:
+    for name in needed:
+        if name not in hand:
             raise ValueError(f"it has no {name!r}")
+        shape = np.shape(hand[name])
+        if shape != SHAPES.get(name, shape):
+            raise ValueError(f"{name!r} has the shape {shape}")
 
 
 def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -206,18 +200,7 @@ def _vacant(hand: Mapping[str, Any]) -> dict[str, Any]:
             return np.full(np.shape(hand[name]), name == "lost").tolist()
         return "" if KINDS[name] is np.str_ else np.full(np.shape(hand[name]), np.nan).tolist()
 
-    return {name: nothing(name) for name in HAND_FIELDS if name in hand}
-
-
-def _record_kind(line: Mapping[str, Any]) -> np.dtype:
-    """Texts are numbers of words; fields of another version are left out."""
-    return np.dtype(
-        [
-            (name, np.int32 if kind is np.str_ else kind, np.shape(line[name]))
-            for name, kind in KINDS.items()
-            if name in line
-        ]
-    )
+    return {name: nothing(name) for name in HAND_FIELDS}
 
 
 def write_results(
@@ -231,7 +214,7 @@ def write_results(
 
     rows: not decreasing.  changed: arrays in place of columns.  small: further arrays.
     """
-    names = [name for name in records.names if name not in changed]
+    names = [name for name in KINDS if name not in changed]
     with _bar("writing the results", len(rows)) as bar:
 
         def pieces(name: str) -> Iterator[np.ndarray]:
@@ -265,9 +248,8 @@ metadata is JSON."""
 
 
 def facts_for_readers(metadata: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays beside those of the frames: names, skeletons, camera, and a text that explains them.
-
-    metadata: of the run; a camera that it does not tell is left out.
+    """Arrays beside those of the frames: skeletons, a text that explains them, and the camera where
+    the run's metadata tell it.
     """
     facts = {
         "readme": np.array(_README),

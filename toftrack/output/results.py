@@ -25,7 +25,6 @@ from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
 from toftrack.output.lines import (
     DROPPED,
-    FROM_THE_START,
     HAND_FIELDS,
     KINDS,
     SHAPES,
@@ -228,7 +227,7 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         "compute_s": seconds,
         DROPPED: dropped,
     }
-    if dropped.any() and "state_name" in records.names:
+    if dropped.any():
         changed["state_name"] = _reported_dropped(records.column("state_name", rows), dropped)
     return rows, changed
 
@@ -249,17 +248,14 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     try:
-        arrays = read_archive(path, {*FROM_THE_START, *KINDS, DROPPED, *_TEXTS})
-        known = (*FROM_THE_START, *(name for name in KINDS if name in arrays))
-        names = (*dict.fromkeys(known), *_TEXTS)
+        names = (*KINDS, DROPPED, *_TEXTS)
+        arrays = read_archive(path, set(names))
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
-        _check_arrays({name: arrays[name] for name in known}, content["metadata"])
-        dropped = arrays[DROPPED]
-        if dropped.dtype != bool or dropped.shape != (len(content["lost"]),):
-            raise ValueError(f"{DROPPED!r} does not fit")
-        content[DROPPED] = dropped
+        if not isinstance(content["metadata"], dict):
+            raise ValueError("the metadata are no object")
+        _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -276,20 +272,19 @@ def read_results(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
+def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     """ValueError where arrays are not of as many frames and slots, or not of the types, that a
-    track.npz has, or where the metadata are no JSON object."""
-    if not isinstance(metadata, dict):
-        raise ValueError("the metadata are no object")
+    track.npz has.
+    """
     slots = arrays["lost"].shape
     if len(slots) not in (1, 2):
         raise ValueError(f"'lost' has the shape {slots}")
     for name, array in arrays.items():
         of_hand = slots if name in HAND_FIELDS else slots[:1]
-        end = SHAPES.get(name, array.shape[len(of_hand) :])
+        end = () if name == DROPPED else SHAPES.get(name, array.shape[len(of_hand) :])
         if array.shape != (*of_hand, *end):
             raise ValueError(f"{name!r} has the shape {array.shape}")
-        known = np.dtype(KINDS.get(name, np.float32)).kind
+        known = np.dtype(KINDS.get(name, np.bool_)).kind
         if array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(known, known):
             raise ValueError(f"{name!r} is {array.dtype}")
 

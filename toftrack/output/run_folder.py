@@ -17,7 +17,7 @@ from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
 from toftrack.help_text import fields_in_help
 from toftrack.json_text import read_json
-from toftrack.output.lines import HAND_FIELDS
+from toftrack.output.lines import HAND_FIELDS, KINDS
 from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
@@ -127,9 +127,7 @@ class Run:
 
     def estimate(self, row: int) -> Estimate:
         """What the tracker said about one frame of a run with one slot, see `slot`."""
-        results = self.results
-        names = {f.name for f in fields(Estimate)} & results.keys()
-        values = {name: results[name][row] for name in names}
+        values = {name: self.results[name][row] for name in KINDS}
         for name, value in values.items():
             if np.ndim(value) == 0:
                 values[name] = value.item()

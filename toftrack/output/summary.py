@@ -27,8 +27,6 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt
 
-_MEASURED = tuple(field.name for field in fields(Estimates))
-
 
 def shape_file(slot: int) -> str:
     """The name of the file with the fitted hand of a slot."""
@@ -134,7 +132,7 @@ def run_metrics(
         return None
     position = np.flatnonzero(counted[inside])
     found = truth.of_frames(index[known])
-    done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
+    done = {field.name: records.column(field.name, rows[known]) for field in fields(Estimates)}
     estimates = Estimates(**found_side(done))
     both = measured(estimates, found)
     if both.slots is None:
