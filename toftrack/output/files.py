@@ -15,8 +15,6 @@ from toftrack.safe_files import check_replaceable, lock, open_in_place, open_to_
 
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
-
-
 _BLOCK = 65536
 WHOLE_FILES = (
     *("run.json", "track.npz", "summary.json", "overlay.png"),
@@ -31,16 +29,10 @@ class LineFile:
     """The growing file of a run's folder, which it locks: the folder has one writer at a time.
 
     A line is in the file as a whole or not at all, unless the process is killed within it. The lock
-    goes with the process, however that ends.
+    goes with the process, however that ends. What was in the file stays there until `clear`.
 
-    What was in the file stays there until `clear`.
-
-    Args:
-        folder: exists.
-
-    Raises:
-        ToftrackError: another run is writing into the folder.
-        OSError: the file cannot be opened, or (by `append`) not be written.
+    Raises ToftrackError: another run is writing into the folder; OSError: the file cannot be
+    opened, or (by `append`) not be written.
     """
 
     def __init__(self, folder: Path) -> None:

@@ -93,7 +93,7 @@ class Run:
         given = BareFacts(device.get("intrinsics"))
         camera = given.camera(store.camera.width, store.camera.height) or store.camera
         if about.get("camera_file"):
-            camera = Camera.load(self.found(about["camera_file"]))
+            camera = Camera.load(found_again(about["camera_file"], self._ran_in))
         rows = _rows(self, store, camera, about, device, name)
         truth = store.truth
         return Footage(store, camera, rows, None if truth is None else truth.of_frames(rows))
@@ -146,7 +146,7 @@ class Run:
         """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
         settings = {k: v for k, v in self._settings("pose_space").items() if k != "_target_"}
         if settings.get("file"):
-            settings["file"] = str(self.found(settings["file"]))
+            settings["file"] = str(found_again(settings["file"], self._ran_in))
         space = make_pose_space(**settings)
         if space.dims != self.results["latent"].shape[-1]:
             raise ToftrackError(
@@ -154,10 +154,6 @@ class Run:
                 "dimensional pose space of the run; put the old file back"
             )
         return space
-
-    def found(self, path: str | Path) -> Path:
-        """A path of the run's configuration as it is now: relative to here, or to where it ran."""
-        return found_again(path, self._ran_in)
 
     @property
     def _ran_in(self) -> str | None:
@@ -220,8 +216,6 @@ def read_run(folder: str | Path) -> Run:
         run.arrays["joints_m"], run.timestamp_s, run.camera, run.summary["frames"]
         run.estimate(30)
 
-    folder: with track.npz, track.jsonl, summary.json and hand_shape.json.
-
     Raises ToftrackError when it is no run's, or something in it is missing or damaged.
     """
     folder = Path(folder).expanduser()
@@ -265,9 +259,8 @@ def open_tracked(
 ) -> tuple[FrameStore, object] | None:
     """The recording that a run's device played, and its name; None when it was a live camera.
 
-    ran_in: the run's working folder.  recording: where it is now, when it is not where it was.
-
-    Raises ToftrackError: it is gone, or cannot be read.
+    ran_in: the run's working folder.  recording: where it is now, if it was moved.  Raises
+    ToftrackError when it is gone, or cannot be read.
     """
     about = metadata.get("device") or {}
     device = (metadata.get("config") or {}).get("device") or {}

@@ -19,7 +19,7 @@ from typing import Any, Self
 from toftrack.checks import check_number
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
-from toftrack.output.stream import Stream, known_fields, report_dropped
+from toftrack.output.stream import Stream, known_fields
 from toftrack.output.web.server import ANY_PORT, Client, WebServer
 
 STREAM = "/stream"
@@ -29,11 +29,9 @@ _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
 class WebSocketStream(Stream):
     """A message a line to every client, and the pages, from a thread of its own within the `with`.
 
-    A client that is too slow loses its oldest lines. Where there is no client nothing is made. The
-    settings: conf/stream/websocket.yaml; `live` is for the devices alone, which follow it.
-
-    Raises ToftrackError for an unknown field or an impossible number; by `with`, when the port is
-    taken or not allowed, or there is no such host here.
+    A client that is too slow loses its oldest lines; where there is none nothing is made. The
+    settings: conf/stream/websocket.yaml; `live` is for the devices alone, which follow it. Raises
+    ToftrackError for an unknown field or an impossible number; by `with`, as WebServer.
     """
 
     def __init__(
@@ -50,8 +48,6 @@ class WebSocketStream(Stream):
         check_number("stream.waiting", waiting, 1, whole=True)
         self._host, self._port, self._waiting = str(host), port, waiting
         self._origins = (origins,) if isinstance(origins, str) else tuple(origins)
-        self.sent = self.dropped = 0
-        """Lines, over all clients."""
 
     def __enter__(self) -> Self:
         self._server = WebServer(
@@ -75,11 +71,8 @@ class WebSocketStream(Stream):
             self._server.call(self._offer, json_line(estimates, self._fields))
 
     def __exit__(self, *exception: Any) -> None:
-        left = self._server.close()
-        self.dropped += left
-        report_dropped(
-            self.sent, f"to clients of {self.url}", self.dropped, "a client was too slow"
-        )
+        self.dropped += self._server.close()
+        self.report(f"to clients of {self.url}", "a client was too slow")
 
     def _offer(self, line: str) -> None:
         for client in self._server.clients:
