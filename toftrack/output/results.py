@@ -210,10 +210,10 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         DROPPED: dropped,
     }
     if dropped.any():
-        names = records.column("state_name", rows)  # (T,) or (T, S)
-        of_frame = dropped.reshape(-1, *(1,) * (names.ndim - 1))
+        states = records.column("state_name", rows)  # (T,) or (T, S)
+        of_frame = dropped.reshape(-1, *(1,) * (states.ndim - 1))
         # A slot without a hand says nothing.
-        changed["state_name"] = np.where(of_frame & (names != ""), DROPPED, names)
+        changed["state_name"] = np.where(of_frame & (states != ""), DROPPED, states)
     return rows, changed
 
 

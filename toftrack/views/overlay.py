@@ -63,21 +63,11 @@ def draw_panel(
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above the left, frame number, gesture and confidence; above the right, state and score. A red
-    caption and frame mark an estimate that is lost, of several hands that all are. The skeleton is
-    missing where the estimate is NaN; see draw_hands for the rest.
-
-    Args:
-        depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
-        amplitude: (H, W), shown in grey; or None.
-        camera: projects the joints.
-        estimates: of this frame, one a slot.
-        models: of each, (H, W) metres of the estimate's surface, anything not positive and finite
-            is background; None leaves it out. Nearer is darker, on white; several hands are tinted
-            with their slots' colours.
-        scale: panel pixels per image pixel.
-
-    Returns:
-        (h, w, 3) uint8 BGR with h and w even; the two sides are the halves of w.
+    caption and frame mark an estimate that is lost, of several hands that all are. The image is the
+    amplitude (H, W) in grey, without it depth_m (H, W), nearer brighter; see draw_hands for what is
+    drawn of the slots' estimates. models: of each, (H, W) metres of its surface, or None; nearer is
+    darker, on white, several hands are tinted with their slots' colours. scale: panel pixels per
+    image pixel. Returns (h, w, 3) uint8 BGR, h and w even; the two sides are the halves of w.
     """
     height, width = depth_m.shape
     # Even, so that a video of it can be encoded.

@@ -267,8 +267,9 @@ class _Entities:
         if is_vacant(estimate):
             self._clear(entity)
             return
-        about = {"labels": [side_words(estimate) or "?"], "colors": [SLOT_RGB[slot]]}
-        self._log(entity, rr.Points3D(estimate.joints_m[:1], radii=2 * _JOINT_M, **about))
+        words, colour = side_words(estimate) or "?", SLOT_RGB[slot]
+        wrist = estimate.joints_m[:1]
+        self._log(entity, rr.Points3D(wrist, labels=[words], colors=[colour], radii=2 * _JOINT_M))
 
     def _log_pinhole(self, entity: str, k: np.ndarray, height: int, width: int) -> None:
         """The camera of an image, when it is not the one before."""
