@@ -70,50 +70,34 @@ def truth_of(estimates: list[Estimate], frames: int) -> Truth:
 
 def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> None:
     write(tmp_path, [estimate(i) for i in range(6)])
-    promised = {
-        "joints_m": ((6, 21, 3), "f4"),
-        "lost": ((6,), "?"),
-        "state": ((6, 27), "f4"),
-        "latent": ((6, 4), "f4"),
-        "score": ((6,), "f4"),
-        "covariance": ((6, 10, 10), "f4"),
-        "joint_sigma_m": ((6, 21, 3), "f4"),
-        "joint_confidence": ((6, 21), "f4"),
-        "joint_ok": ((6, 21), "?"),
-        "effective_sample_size": ((6,), "f4"),
-        "gesture_probability": ((6,), "f4"),
-        "pinch": ((6,), "f4"),
-        "pinching": ((6,), "?"),
-        "confidence": ((6,), "f4"),
-        "outside_rad": ((6,), "f4"),
-        "side_probability": ((6,), "f4"),
-        "index": ((6,), "i8"),
-        "pointing_origin_m": ((6, 3), "f4"),
-        "pointing_direction": ((6, 3), "f4"),
-        "landmarks": ((6, 21, 3), "f4"),
-        "openxr_position_m": ((6, 26, 3), "f4"),
-        "openxr_orientation": ((6, 26, 4), "f4"),
-        "openxr_radius_m": ((6, 26), "f4"),
-        "joint_parents": ((21,), "i8"),
-        "openxr_joint_parents": ((26,), "i8"),
-        "timestamp_s": ((6,), "f8"),
-        "compute_s": ((6,), "f4"),
-        "dropped": ((6,), "?"),
+    promised: dict[tuple[str, tuple[int, ...]], str] = {
+        ("f4", (21, 3)): "joints_m joint_sigma_m landmarks",
+        ("f4", (21,)): "joint_confidence",
+        ("f4", (27,)): "state",
+        ("f4", (4,)): "latent",
+        ("f4", (10, 10)): "covariance",
+        ("f4", (3,)): "pointing_origin_m pointing_direction",
+        ("f4", (26, 3)): "openxr_position_m",
+        ("f4", (26, 4)): "openxr_orientation",
+        ("f4", (26,)): "openxr_radius_m",
+        ("f4", ()): "score effective_sample_size gesture_probability pinch confidence outside_rad "
+        "side_probability compute_s",
+        ("f8", ()): "timestamp_s",
+        ("i8", ()): "index",
+        ("?", ()): "lost pinching dropped",
+        ("?", (21,)): "joint_ok",
+        ("U", ()): "gesture state_name side",
     }
+    names = {"joint_names", "openxr_joint_names", "angle_names"}
+    parents = {"joint_parents", "openxr_joint_parents"}
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
-        texts = {
-            "gesture",
-            "state_name",
-            "side",
-            "joint_names",
-            "openxr_joint_names",
-            "angle_names",
-        }
-        assert set(archive.files) == {*promised, *texts, "readme", "metadata"}
-        for name, (shape, kind) in promised.items():
-            assert archive[name].shape == shape, name
-            assert archive[name].dtype == np.dtype(kind), name
-        assert all(archive[name].dtype.kind == "U" for name in texts)
+        every = {name for words in promised.values() for name in words.split()}
+        assert set(archive.files) == every | names | parents | {"readme", "metadata"}
+        for (kind, shape), words in promised.items():
+            for name in words.split():
+                assert archive[name].shape == (6, *shape), name
+                found = archive[name].dtype
+                assert found.kind == "U" if kind == "U" else found == np.dtype(kind), name
         assert archive["joint_names"].tolist() == list(NAMES)
         assert json.loads(archive["metadata"].item()) == {"seed": 1}
 
@@ -173,27 +157,20 @@ def test_frames_without_estimate_are_null_in_lines_and_nan_in_arrays(tmp_path: P
 
     text = (tmp_path / "track.jsonl").read_text()
     first, second = (json.loads(line, parse_constant=refuse) for line in text.splitlines())
-    assert first["joints_m"][0] == [None] * 3
-    assert first["gesture_probability"] is None
-    assert first["lost"] is True
-    assert second["joints_m"][0][0] is not None
+    assert first["joints_m"][0] == [None] * 3 and first["gesture_probability"] is None
+    assert first["lost"] is True and second["joints_m"][0][0] is not None
     content = read_results(tmp_path / "track.npz")
-    assert np.isnan(content["joints_m"][0]).all()
-    assert np.isfinite(content["joints_m"][1]).all()
+    assert np.isnan(content["joints_m"][0]).all() and np.isfinite(content["joints_m"][1]).all()
     json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
 
 
 def test_summary_counts_and_averages(tmp_path: Path) -> None:
     writer = write(tmp_path, [estimate(i) for i in range(5)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary == writer.summary
-    assert summary["frames"] == 5
-    assert summary["lost_frames"] == 1
-    assert summary["mean_ms"] == pytest.approx(30)
-    assert summary["median_ms"] == pytest.approx(30)
-    assert summary["fps"] == pytest.approx(100 / 3)
-    assert summary["mean_score"] == pytest.approx(0.52)
-    assert "metrics" not in summary
+    assert summary == writer.summary and "metrics" not in summary
+    assert (summary["frames"], summary["lost_frames"]) == (5, 1)
+    figures = [summary[name] for name in ("mean_ms", "median_ms", "fps", "mean_score")]
+    assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
 
 
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
@@ -218,11 +195,10 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        with ResultWriter(tmp_path, {}, NAMES, None) as writer:
-            writer.append((estimate(0),))
-            writer.append((estimate(1),))
-            raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt), ResultWriter(tmp_path, {}, NAMES, None) as writer:
+        writer.append((estimate(0),))
+        writer.append((estimate(1),))
+        raise KeyboardInterrupt
     assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
 
@@ -320,15 +296,22 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     assert many - few < 200 * 200  # a frame's numbers alone are 1100 bytes
 
 
+def recovered(folder: Path, summary: dict[str, Any] | None) -> dict[str, Any]:
+    """What was written, which is recovered from the lines as it was."""
+    before = read_results(folder / "track.npz")
+    for name in ("track.npz", "summary.json"):
+        (folder / name).unlink()
+    assert json.dumps(recover(folder)) == json.dumps(summary)  # NaN, too
+    after = read_results(folder / "track.npz")
+    for name in LINE_FIELDS:
+        np.testing.assert_array_equal(after[name], before[name])
+    return before
+
+
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
     odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
     many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
-    write(tmp_path, many)
-    before = read_results(tmp_path / "track.npz")
-    recover(tmp_path)
-    after = read_results(tmp_path / "track.npz")
-    for name in LINE_FIELDS:
-        np.testing.assert_array_equal(after[name], before[name])
+    recovered(tmp_path, write(tmp_path, many).summary)
 
 
 def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
@@ -340,24 +323,35 @@ def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
             writer.append((vacant, there, there if i else vacant))
     lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
     assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[1], *[[1, 2]] * 3]
-    before = read_results(tmp_path / "track.npz")
-    assert before["joints_m"].shape == (4, 3, 21, 3) and before["timestamp_s"].shape == (4,)
-    assert before["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
-    assert before["side"][3].tolist()[2] == "left" and np.isnan(before["joints_m"][:, 0]).all()
-    recover(tmp_path)
-    after = read_results(tmp_path / "track.npz")
-    for name in LINE_FIELDS:
-        np.testing.assert_array_equal(after[name], before[name])
+    content = recovered(tmp_path, writer.summary)
+    assert content["joints_m"].shape == (4, 3, 21, 3) and content["timestamp_s"].shape == (4,)
+    assert content["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
+    assert content["side"][3, 2] == "left" and np.isnan(content["joints_m"][:, 0]).all()
 
 
-def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "bad", "words"),
+    [
+        (1, "{]", "line 2 of"),
+        (1, '{"index":1}', "shortly before"),
+        (0, {"index": None}, "has no 'index'"),
+        (0, {"joints_m": [[0, 0, 0]]}, "shape"),
+        (0, {"index": 10**19}, "shortly before"),
+    ],
+)
+def test_a_line_that_is_damaged_is_named(
+    tmp_path: Path, number: int, bad: str | dict[str, Any], words: str
+) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"
-    lines = path.read_text().splitlines(keepends=True)
-    for bad, words in (("{]\n", "line 2 of"), ('{"index":1}\n', "shortly before")):
-        path.write_text("".join([lines[0], bad, *lines[2:]]))
-        with pytest.raises(ToftrackError, match=words):
-            recover(tmp_path)
+    lines = path.read_text().splitlines()
+    if isinstance(bad, dict):
+        line = json.loads(lines[number]) | bad
+        bad = json.dumps({k: v for k, v in line.items() if v is not None or k not in bad})
+    lines[number] = bad
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ToftrackError, match=words):
+        recover(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -376,28 +370,6 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     with pytest.raises(ToftrackError) as error:
         recover(tmp_path)
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "reported"),
-    [
-        ("index", None, "has no 'index'"),
-        ("joints_m", [[0, 0, 0]], "shape"),
-        ("index", 10**19, "line 1 of"),
-    ],
-)
-def test_a_first_line_that_is_damaged_is_named(
-    tmp_path: Path, field: str, value: object, reported: str
-) -> None:
-    write(tmp_path, [estimate(0)])
-    path = tmp_path / "track.jsonl"
-    line = json.loads(path.read_text())
-    line[field] = value
-    path.write_text(json.dumps({k: v for k, v in line.items() if v is not None or k != field}))
-    with open(path, "a") as stream:
-        stream.write("\n")
-    with pytest.raises(ToftrackError, match=reported):
-        recover(tmp_path)
 
 
 def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
@@ -422,17 +394,14 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
     summary = write(tmp_path, done, truth).summary
     content = read_results(tmp_path / "track.npz")
-    rows = [2, 3, 3, 3, 6, 7]
-    np.testing.assert_array_equal(
-        content["joints_m"], np.array([estimate(i).joints_m for i in rows])
-    )
+    shown = [estimate(i) for i in (2, 3, 3, 3, 6, 7)]
+    np.testing.assert_array_equal(content["joints_m"], np.array([one.joints_m for one in shown]))
     np.testing.assert_allclose(content["timestamp_s"], np.arange(2, 8) / 25)
     assert content["compute_s"][2:4].tolist() == [0, 0]
     assert content["metadata"]["held_frames"] == [4, 5]
-    assert content["dropped"].tolist() == [False, False, True, True, False, False]
-    reported = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
-    assert content["state_name"].tolist() == reported
-    assert content["lost"].tolist() == [estimate(i).lost for i in rows]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 3]
+    assert content["state_name"].tolist() == ["tracking"] * 2 + ["dropped"] * 2 + ["tracking"] * 2
+    assert content["lost"].tolist() == [one.lost for one in shown]
     # A dropped frame has no line: its number is missing.
     assert [line["index"] for line in read_lines(tmp_path / "track.jsonl")] == [2, 3, 6, 7]
     assert summary["frames"] == 6
@@ -442,12 +411,8 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
 def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
     metadata = {"K": np.eye(2), "file": Path("a"), "unknown": math.nan, "n": np.int64(3)}
     ResultWriter(tmp_path, metadata, NAMES, None).close()
-    assert read_results(tmp_path / "track.npz")["metadata"] == {
-        "K": [[1, 0], [0, 1]],
-        "file": "a",
-        "unknown": None,
-        "n": 3,
-    }
+    kept = {"K": [[1, 0], [0, 1]], "file": "a", "unknown": None, "n": 3}
+    assert read_results(tmp_path / "track.npz")["metadata"] == kept
 
 
 def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:

@@ -86,38 +86,34 @@ def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path:
     lines = lines_of(tmp_path)
     assert all(tuple(line) == ("index", "timestamp_s", "compute_s", "hands") for line in lines)
     assert set(FRAME_FIELDS) | set(HAND_FIELDS) == set(LINE_FIELDS)
-    reported = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
-    assert reported[0] == [(0, "left")] and reported[3] == [(0, "left"), (1, "right")]
+    sides = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
+    assert sides[0] == [(0, "left")] and sides[3] == [(0, "left"), (1, "right")]
     assert set(lines[3]["hands"][1]) == {"slot", *HAND_FIELDS}
     assert lines[5]["hands"][1]["lost"] is True, "a doubted hand is listed"
     assert json.loads(json_line((vacant(7), vacant(7))))["hands"] == []
-
-
-def test_chosen_fields_stand_where_they_belong() -> None:
-    line = json.loads(json_line((vacant(3), hand(3, 1)), ("index", "lost", "gesture")))
+    some = json.loads(json_line((vacant(3), hand(3, 1)), ("index", "lost", "gesture")))
     reported = {"slot": 1, "side": "right", "lost": False, "gesture": "fist"}
-    assert line == {"index": 3, "hands": [reported]}
+    assert some == {"index": 3, "hands": [reported]}
 
 
 def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_path: Path) -> None:
     done = frames()
     write(tmp_path, done)
     content = read_results(tmp_path / "track.npz")
+    for name in FRAME_FIELDS:
+        assert content[name].shape == (FRAMES,), name
     for name in HAND_FIELDS:
         assert content[name].shape[:2] == (FRAMES, 2), name
         for row, slot in ((0, 0), (5, 1), (11, 1)):
             one = np.asarray(getattr(done[row][slot], name), content[name].dtype)
             np.testing.assert_array_equal(content[name][row, slot], one, name)
-    for name in FRAME_FIELDS:
-        assert content[name].shape == (FRAMES,), name
-    assert content["joints_m"].shape == (FRAMES, 2, 21, 3)
-    assert content["lost"][:3, 1].all() and not content["lost"][:3, 0].any()
-    for name in HAND_FIELDS:
         empty = content[name][0, 1]
         if empty.dtype.kind == "f":
             assert np.isnan(empty).all(), name
         elif empty.dtype.kind == "U":
             assert empty == "", name
+    assert content["joints_m"].shape == (FRAMES, 2, 21, 3)
+    assert content["lost"][:3, 1].all() and not content["lost"][:3, 0].any()
     assert not content["pinching"][0, 1]
 
 
@@ -182,17 +178,6 @@ def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
     assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
     assert summary["metrics"]["ghost_pct"] == 100
     assert "another hand, where is none" in metrics_table(summary)
-
-
-def test_a_run_that_was_killed_is_recovered(tmp_path: Path) -> None:
-    summary = write(tmp_path, frames())
-    before = read_results(tmp_path / "track.npz")
-    for name in ("track.npz", "summary.json"):
-        (tmp_path / name).unlink()
-    assert recover(tmp_path) == summary
-    after = read_results(tmp_path / "track.npz")
-    for name in LINE_FIELDS:
-        np.testing.assert_array_equal(after[name], before[name])
 
 
 def test_a_slot_that_there_is_not_is_a_damaged_line(tmp_path: Path) -> None:
