@@ -334,7 +334,7 @@ def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
     [
         (1, "{]", "line 2 of"),
         (1, '{"index":1}', "shortly before"),
-        (0, {"index": None}, "has no 'index'"),
+        (0, {"index": None}, "'index'"),
         (0, {"joints_m": [[0, 0, 0]]}, "shape"),
         (0, {"index": 10**19}, "shortly before"),
     ],

@@ -12,6 +12,7 @@ that of the frames. A slot without a hand is lost, its numbers are NaN, its text
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,7 +30,6 @@ from toftrack.output.lines import (
     FRAME_FIELDS,
     HAND_FIELDS,
     KINDS,
-    SHAPES,
     damaged,
     read_lines,
 )
@@ -45,21 +45,23 @@ _SOON_S = 2.0
 class Records:
     """The frames of a run, for a `with`; each field is a column.
 
-    They are kept in the folder, under no name. like: what a line says of a hand, or of a frame of
-    one; tells the shapes.  slots: of each frame; of several, a line has `hands`.
+    They are kept in the folder, under no name. latent_size: of the pose space.  slots: of each
+    frame; of several, a line has `hands`.
 
     Raises OSError (by `append`, too) when the records cannot be kept there.
     """
 
-    def __init__(self, folder: Path, like: Mapping[str, Any], slots: int) -> None:
+    def __init__(self, folder: Path, latent_size: int, slots: int) -> None:
         self.slots, self.count = slots, 0
         self._words: dict[str, int] = {}
-        self._vacant = _vacant(like)
-        frame = dict.fromkeys(FRAME_FIELDS, 0)
-        line = like if slots == 1 else self._side_by_side(frame | {"hands": []})
+        unknown = dict.fromkeys(("score", "confidence", "effective_sample_size"), math.nan)
+        vacant = no_estimate(0, 0, "", latent_size, 0).updated(**unknown).values()
+        self._vacant = {name: vacant[name] for name in HAND_FIELDS}
+        of_slots = (slots,) if slots > 1 else ()
+        axes = {name: of_slots if name in HAND_FIELDS else () for name in KINDS}
         self._kind = np.dtype(  # texts are numbers of words
             [
-                (name, np.int32 if kind is np.str_ else kind, np.shape(line[name]))
+                (name, np.int32 if kind is np.str_ else kind, axes[name] + np.shape(vacant[name]))
                 for name, kind in KINDS.items()
             ]
         )
@@ -67,32 +69,25 @@ class Records:
 
     @classmethod
     def of_lines(cls, lines: Path, latent_size: int, slots: int) -> Records:
-        """The records of a track.jsonl, which is read at once; latent_size is for one without hand.
+        """The records of a track.jsonl, which is read at once.
 
         Raises ToftrackError for a damaged line, OSError when the lines cannot be read.
         """
-        like = next(read_lines(lines), None)
-        if slots > 1:  # which fields there are, any hand says
-            like = next((hand for line in read_lines(lines) for hand in _hands(line)), None)
         with open_to_read(lines) as stream:
             count = sum(1 for _ in stream)
-        last = 1
+        records, last = cls(lines.parent, latent_size, slots), 0
         try:
-            like = like or no_estimate(0, 0, "", latent_size, 0).values()
-            _check(like, HAND_FIELDS if slots > 1 else tuple(KINDS))
-            records = cls(lines.parent, like, slots)
-            try:
-                read = read_lines(lines)
-                with _bar("reading the lines", count) as bar:
-                    while piece := list(itertools.islice(read, _PIECE)):
-                        last = records.count + len(piece)
-                        records._keep(piece)
-                        bar.update(len(piece))
-            except BaseException:
-                records.close()
-                raise
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
+            read = read_lines(lines)
+            with _bar("reading the lines", count) as bar:
+                while piece := list(itertools.islice(read, _PIECE)):
+                    last += len(piece)
+                    records._keep(piece)
+                    bar.update(len(piece))
+        except BaseException as error:
+            records.close()
+            if isinstance(error, (ArithmeticError, LookupError, TypeError, ValueError)):
+                raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
+            raise
         return records
 
     def append(self, estimates: Sequence[Estimate]) -> None:
@@ -156,7 +151,9 @@ class Records:
                 array = np.array(values, self._kind[name].base)
             if array.dtype.kind == "f":
                 array[np.isinf(array)] = np.nan  # as in the lines
-            records[name] = array.reshape(len(lines), *self.shape(name))
+            if array.shape != records[name].shape:
+                raise ValueError(f"{name!r} has the shape {array.shape[1:]}")
+            records[name] = array
         self._file.write(records.tobytes())
         self.count += len(lines)
 
@@ -173,34 +170,6 @@ class Records:
             slots[hand["slot"]] = hand
         frame = {name: line[name] for name in FRAME_FIELDS}
         return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
-
-
-def _check(hand: Mapping[str, Any], needed: Sequence[str]) -> None:
-    """ValueError where what a line says of a hand lacks a field, or has one of another shape."""
-    for name in needed:
-        if name not in hand:
-            raise ValueError(f"it has no {name!r}")
-        shape = np.shape(hand[name])
-        if shape != SHAPES.get(name, shape):
-            raise ValueError(f"{name!r} has the shape {shape}")
-
-
-def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Those of a line that is of several; none of another one, which is reported later."""
-    hands = line.get("hands")
-    reported = hands if isinstance(hands, list) else []
-    return [hand for hand in reported if isinstance(hand, dict)]
-
-
-def _vacant(hand: Mapping[str, Any]) -> dict[str, Any]:
-    """What stands where a slot has no hand, with the fields and shapes of one that there is."""
-
-    def nothing(name: str) -> Any:
-        if KINDS[name] is np.bool_:
-            return np.full(np.shape(hand[name]), name == "lost").tolist()
-        return "" if KINDS[name] is np.str_ else np.full(np.shape(hand[name]), np.nan).tolist()
-
-    return {name: nothing(name) for name in HAND_FIELDS}
 
 
 def write_results(

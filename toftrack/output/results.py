@@ -106,7 +106,7 @@ class ResultWriter:
         try:
             self._lines.append(json_line(estimates))
             if self._records is None:
-                self._records = Records(self.folder, estimates[0].values(), len(estimates))
+                self._records = Records(self.folder, estimates[0].latent.size, len(estimates))
             self._records.append(estimates)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error

@@ -46,8 +46,6 @@ class Run:
     """Of `read_results`: the arrays of track.npz, `joint_names` and `metadata`."""
     frames: np.ndarray
     """(T,) int64 numbers of the input frames."""
-    state_names: tuple[str, ...]
-    """T texts, of a dropped frame that of the one before; of slots that of the first."""
     summary: dict[str, Any]
     """Of summary.json."""
     shapes: tuple[HandShape, ...]
@@ -117,9 +115,7 @@ class Run:
             name: array[:, number] if name in HAND_FIELDS else array
             for name, array in self.results.items()
         }
-        names = tuple(results["state_name"].tolist())
-        shapes = self.shapes[number : number + 1]
-        return replace(self, results=results, state_names=names, shapes=shapes)
+        return replace(self, results=results, shapes=self.shapes[number : number + 1])
 
     def estimates(self, row: int) -> tuple[Estimate, ...]:
         """What the tracker said about one frame, one a slot."""
@@ -131,7 +127,6 @@ class Run:
         for name, value in values.items():
             if np.ndim(value) == 0:
                 values[name] = value.item()
-        values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
         return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
@@ -236,14 +231,13 @@ def read_run(folder: str | Path) -> Run:
     if not len(results["lost"]):
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to read")
     slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
-    of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
     what = f"'{folder / 'summary.json'}' cannot be read"
     with reported_errors(what, "run track.py again", OSError, ValueError):
         summary = read_json(folder / "summary.json")
         if not isinstance(summary, dict):
             raise ValueError("it is no JSON object")
     shapes = tuple(HandShape.load(folder / shape_file(slot)) for slot in range(slots))
-    return Run(folder, results, results["index"], tuple(of_first.tolist()), summary, shapes)
+    return Run(folder, results, results["index"], summary, shapes)
 
 
 def found_again(path: str | Path, ran_in: str | None) -> Path:
