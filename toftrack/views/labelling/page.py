@@ -60,11 +60,13 @@ class LabelPage:
             "side": content["side"],
             "joints": LABELLED,
             "gestures": self.gestures,
-            "frames": [
-                {"number": number, **_shown(self.labels.frames[str(number)])}
-                for number in self.frames
-            ],
+            "frames": [self._labels_of(number) for number in self.frames],
         }
+
+    def _labels_of(self, number: int) -> dict[str, Any]:
+        frame = self.labels.frames[str(number)]
+        points = {name: point for name, point in frame["points"].items() if name in LABELLED}
+        return {"number": number, "points": points, "gesture": frame.get("gesture")}
 
     def change(self, content: dict[str, Any]) -> None:
         """Do what a message asks for; ValueError for what cannot be meant, ToftrackError where it
@@ -73,20 +75,15 @@ class LabelPage:
         if "side" in content:
             self.labels.set_side(content["side"])
             return
-        kind = "point" if "point" in content else "gesture"
-        given = content.get(kind)
-        if not isinstance(given, list) or len(given) != (3 if kind == "point" else 2):
-            raise ValueError("the message is none that this server knows")
-        if kind == "point":
-            self.labels.set_point(*given)
-        else:
-            self.labels.set_gesture(*given)
-
-
-def _shown(frame: dict[str, Any]) -> dict[str, Any]:
-    """What the page needs of a frame's labels."""
-    points = {name: point for name, point in frame["points"].items() if name in LABELLED}
-    return {"points": points, "gesture": frame.get("gesture")}
+        for name, count, change in (
+            ("point", 3, self.labels.set_point),
+            ("gesture", 2, self.labels.set_gesture),
+        ):
+            given = content.get(name)
+            if isinstance(given, list) and len(given) == count:
+                change(*given)
+                return
+        raise ValueError("the message is none that this server knows")
 
 
 def _picture(frame: LabelFrame) -> dict[str, Any]:
