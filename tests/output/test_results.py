@@ -1,14 +1,15 @@
-"""Results: the promised files with the promised content, also for a run that ended early."""
+"""Results: the promised files with the promised content, also for a run that ended early, and of
+several hands.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import io
 import json
 import math
 import tracemalloc
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +23,9 @@ from toftrack.evaluation.measures import coverage
 from toftrack.evaluation.metrics import evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames import Truth
+from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.lines import LINE_FIELDS, read_lines
+from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, LINE_FIELDS, json_line, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.summary import metrics_table
 from toftrack.programs.recover import recover
@@ -46,7 +48,7 @@ def estimate(index: int, **changes: Any) -> Estimate:
         side_probability=1.0,
         gesture="palm",
     )
-    return dataclasses.replace(whole, **changes)
+    return replace(whole, **changes)
 
 
 def write(
@@ -59,6 +61,10 @@ def write(
         for one in estimates:
             writer.append((one,))
     return writer
+
+
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "track.jsonl").read_text().splitlines()]
 
 
 def truth_of(estimates: list[Estimate], frames: int) -> Truth:
@@ -286,7 +292,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
         tracemalloc.start()
         with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
             for i in range(frames):
-                writer.append((dataclasses.replace(one, index=i),))
+                writer.append((replace(one, index=i),))
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return found
@@ -321,7 +327,7 @@ def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
             vacant = no_estimate(i, 0.04 * i, "searching", 4, 0.01)
             there = estimate(i, lost=False, side="left")
             writer.append((vacant, there, there if i else vacant))
-    lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
+    lines = lines_of(tmp_path)
     assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[1], *[[1, 2]] * 3]
     content = recovered(tmp_path, writer.summary)
     assert content["joints_m"].shape == (4, 3, 21, 3) and content["timestamp_s"].shape == (4,)
@@ -373,7 +379,7 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
 
 
 def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(0), dataclasses.replace(estimate(1), index=10**15)])
+    write(tmp_path, [estimate(0), replace(estimate(1), index=10**15)])
     assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
 
 
@@ -454,3 +460,149 @@ def test_arrays_that_do_not_fit_together_are_no_result(
     np.savez(path, **(arrays | changes))
     with pytest.raises(ToftrackError, match=r"is not a track\.npz, or it is damaged"):
         read_results(path)
+
+
+FRAMES = 12
+TWO = {"config": {"hands": 2}}
+
+
+def vacant(index: int) -> Estimate:
+    return no_estimate(index, index / 25, "searching", 4, 0.01)
+
+
+def hand(index: int, slot: int) -> Estimate:
+    of_slot = {"side": ("left", "right")[slot], "gesture": ("palm", "fist")[slot]}
+    of_slot |= {"score": 0.5 + slot / 4, "side_probability": 0.75, "lost": False}
+    return replace(estimate(index + 100 * slot, **of_slot), index=index, timestamp_s=index / 25)
+
+
+def two_hands() -> list[tuple[Estimate, Estimate]]:
+    """Both hands; the second one is not there in frames 0 to 2, and doubted in frame 5."""
+    return [
+        (hand(i, 0), vacant(i) if i < 3 else replace(hand(i, 1), lost=i == 5))
+        for i in range(FRAMES)
+    ]
+
+
+def two_truths() -> Truth:
+    """Both hands 10 mm off in each coordinate, the second one's visible from frame 3 on."""
+    there, yes = np.arange(FRAMES) >= 3, np.ones(FRAMES, bool)
+    joints = [np.stack([hand(i, slot).joints_m + 0.01 for i in range(FRAMES)]) for slot in (0, 1)]
+    return Truth(joints[1], there, yes, other=Truth(joints[0], yes, yes))
+
+
+def write_slots(
+    folder: Path, estimates: list[tuple[Estimate, ...]], known: Truth | None = None
+) -> dict[str, Any]:
+    with ResultWriter(folder, TWO, NAMES, known) as writer:
+        for both in estimates:
+            writer.append(both)
+    assert writer.summary is not None
+    return writer.summary
+
+
+def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path: Path) -> None:
+    write_slots(tmp_path, two_hands())
+    lines = lines_of(tmp_path)
+    assert all(tuple(line) == ("index", "timestamp_s", "compute_s", "hands") for line in lines)
+    assert set(FRAME_FIELDS) | set(HAND_FIELDS) == set(LINE_FIELDS)
+    sides = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
+    assert sides[0] == [(0, "left")] and sides[3] == [(0, "left"), (1, "right")]
+    assert set(lines[3]["hands"][1]) == {"slot", *HAND_FIELDS}
+    assert lines[5]["hands"][1]["lost"] is True, "a doubted hand is listed"
+    assert json.loads(json_line((vacant(7), vacant(7))))["hands"] == []
+    some = json.loads(json_line((vacant(3), hand(3, 1)), ("index", "lost", "gesture")))
+    reported = {"slot": 1, "side": "right", "lost": False, "gesture": "fist"}
+    assert some == {"index": 3, "hands": [reported]}
+
+
+def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_path: Path) -> None:
+    done = two_hands()
+    write_slots(tmp_path, done)
+    content = read_results(tmp_path / "track.npz")
+    for name in FRAME_FIELDS:
+        assert content[name].shape == (FRAMES,), name
+    for name in HAND_FIELDS:
+        assert content[name].shape[:2] == (FRAMES, 2), name
+        for row, slot in ((0, 0), (5, 1), (11, 1)):
+            one = np.asarray(getattr(done[row][slot], name), content[name].dtype)
+            np.testing.assert_array_equal(content[name][row, slot], one, name)
+        empty = content[name][0, 1]
+        if empty.dtype.kind == "f":
+            assert np.isnan(empty).all(), name
+        elif empty.dtype.kind == "U":
+            assert empty == "", name
+    assert content["joints_m"].shape == (FRAMES, 2, 21, 3)
+    assert content["lost"][:3, 1].all() and not content["lost"][:3, 0].any()
+    assert not content["pinching"][0, 1]
+
+
+def test_frames_without_any_hand_are_whole_rows(tmp_path: Path) -> None:
+    """Also where no frame has one: the shapes are as ever."""
+    write_slots(tmp_path / "never", [(vacant(i), vacant(i)) for i in range(3)])
+    write_slots(tmp_path / "none", [])
+    for name, rows in (("never", 3), ("none", 0)):
+        content = read_results(tmp_path / name / "track.npz")
+        assert content["covariance"].shape == (rows, 2, 10, 10)
+        assert content["lost"].all() and np.isnan(content["score"]).all()
+    summary = json.loads((tmp_path / "never" / "summary.json").read_text())
+    assert (summary["lost_frames"], summary["mean_score"]) == (3, None)
+    assert "3, 3 of them lost" in metrics_table(summary)
+
+
+def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
+    write_slots(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)])
+    content = read_results(tmp_path / "track.npz")
+    assert content["metadata"]["held_frames"] == [2, 7]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
+    there = content["state_name"] != ""  # a slot without a hand says nothing
+    assert ((content["state_name"] == "dropped") == content["dropped"][:, None] & there).all()
+    assert there[2].tolist() == [True, False]
+    np.testing.assert_array_equal(content["joints_m"][7], content["joints_m"][6])
+    assert content["lost"][2].tolist() == [False, True]
+
+
+def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
+    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
+        default_hand_shape(0.17 + slot / 100).of_side(("left", "right")[slot]).save(tmp_path / name)
+    summary = write_slots(tmp_path, two_hands())
+    assert (summary["frames"], summary["lost_frames"]) == (FRAMES, 0)
+    first, second = summary["slots"]
+    assert (first["frames"], second["frames"]) == (FRAMES, FRAMES - 3)
+    assert (first["lost_frames"], second["lost_frames"]) == (0, 1)
+    assert (first["mean_score"], second["mean_score"]) == pytest.approx((0.5, 0.75))
+    assert [one["hand"]["side"] for one in (first, second)] == ["left", "right"]
+    assert second["hand"]["length_mm"] == pytest.approx(180)
+    assert "slot 1" in metrics_table(summary)
+
+
+def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
+    known = two_truths()
+    metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
+    content = read_results(tmp_path / "track.npz")
+    assert (metrics["slot"], metrics["second"]["slot"]) == (1, 0)
+    for found, one in ((metrics, known), (metrics["second"], known.other)):
+        assert one is not None
+        joints, lost = content["joints_m"][:, found["slot"]], content["lost"][:, found["slot"]]
+        assert found["trust"] == asdict(trust(judged(joints, lost, one)))
+        figures = evaluate(joints, lost, one)
+        assert {name: found[name] for name in figures} == figures
+        assert found["coverage"]["in_region_90_pct"] == 100
+    assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
+    table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
+    assert "the other hand" in table and table.count("usable") == 2
+
+
+def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
+    summary = write_slots(tmp_path, two_hands(), replace(two_truths(), other=None))
+    assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
+    assert summary["metrics"]["ghost_pct"] == 100
+    assert "another hand, where is none" in metrics_table(summary)
+
+
+def test_a_slot_that_there_is_not_is_a_damaged_line(tmp_path: Path) -> None:
+    write_slots(tmp_path, two_hands())
+    path = tmp_path / "track.jsonl"
+    path.write_text(path.read_text().replace('"slot":1', '"slot":7'))
+    with pytest.raises(ToftrackError, match="not a line of a run"):
+        recover(tmp_path)
