@@ -11,7 +11,7 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from helpers.moments import one_hand, with_hand
+from helpers.moments import tracked, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import make_tracker
 from websockets.sync.client import connect
@@ -26,14 +26,7 @@ PATIENCE_S = 20
 @cache
 def moments() -> tuple[TrackedFrame, ...]:
     """Two tracked frames of the sample, which look different."""
-    device, tracker = Sample(start=40, stop=46), make_tracker()
-    kept = []
-    for frame in device:
-        depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
-        estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        kept.append(
-            one_hand(frame, depth, device.camera, estimate, shape, tracker.hands.insights[0])
-        )
+    kept = tracked(Sample(start=40, stop=46), make_tracker())
     return kept[0], kept[-1]
 
 

@@ -8,11 +8,24 @@ from typing import Any
 import numpy as np
 
 from toftrack.camera import Camera
+from toftrack.devices.base import Device
 from toftrack.estimate import Estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.state import StepInfo
+from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import TrackedFrame, TrackedHand
+
+
+def tracked(device: Device, tracker: Tracker) -> list[TrackedFrame]:
+    """A device's frames, as they are tracked."""
+    kept = []
+    for frame in device:
+        depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
+        estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+        insight = tracker.hands.insights[0]
+        kept.append(one_hand(frame, depth, device.camera, estimate, shape, insight))
+    return kept
 
 
 def one_hand(
@@ -36,9 +49,8 @@ def two_hands(moment: TrackedFrame, shift_m: float = 0.15, **changes: Any) -> Tr
     state = first.estimate.state.copy()
     state[:3] += move
     side = "left" if first.shape.side == "right" else "right"
-    estimate = replace(
-        first.estimate, joints_m=first.estimate.joints_m + move, state=state, side=side, **changes
-    )
+    reported = {"joints_m": first.estimate.joints_m + move, "state": state, "side": side}
+    estimate = replace(first.estimate, **reported | changes)
     return replace(moment, hands=(first, TrackedHand(estimate, first.shape.of_side(side), None)))
 
 

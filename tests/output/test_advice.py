@@ -93,3 +93,20 @@ def test_advice_to_who_watches_is_of_what_is_recent() -> None:
         watch.see((replace(lost, lost=False),), nothing, (None,))
     assert watch.advice(None, recent=True) == ()
     assert watch.facts[0].counts["lost"] == 60, "the run's are all"
+
+
+def test_a_slot_counts_only_where_it_had_a_hand() -> None:
+    vacant, depth = no_estimate(0, 0.0, "lost", 4, 0.01), np.full((30, 40), 0.5, np.float32)
+    tracked = replace(vacant, lost=False, state=np.zeros(27, np.float32))
+    watch = Watch(1.2, slots=2)
+    nothing = (None, None)
+    for _ in range(4):
+        watch.see((tracked, vacant), depth, nothing)
+    assert watch.advice(None) == () and watch.facts[1].counts["frames"] == 0
+    for _ in range(6):
+        watch.see((vacant, vacant), depth, nothing)
+        watch.see((tracked, replace(tracked, lost=True)), depth, nothing)
+    assert [watch.facts[0].counts[name] for name in ("lost", "frames")] == [6, 16]
+    reported = watch.advice(None)
+    assert reported and all(sentence.startswith("Slot 1: ") for sentence in reported)
+    assert not any("hand.side" in sentence for sentence in reported)

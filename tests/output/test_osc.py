@@ -82,20 +82,13 @@ def test_landmarks_and_the_joints_of_openxr_are_reported_on_demand(receiver: soc
 
 
 def test_each_of_several_hands_has_addresses_of_its_own() -> None:
-    frame = ("index", "timestamp_s")
-    hands = [line_content((hand_estimate(5, side),)) for side in ("right", "left")]
-    line = {name: hands[0][name] for name in frame} | {
-        "hands": [
-            {name: value for name, value in hand.items() if name not in frame} | {"slot": slot}
-            for slot, hand in enumerate(hands)
-        ]
-    }
-    found = dict(messages(line, PARTS))
+    hands = [hand_estimate(5, side) for side in ("right", "left")]
+    found = dict(messages(line_content(hands), PARTS))
     assert list(found)[0] == "/toftrack/frame"
-    for side, hand in zip(("right", "left"), hands, strict=True):
-        assert found[f"/toftrack/{side}/tracked"] == [("i", 1)]
-        wrist = [value for _, value in found[f"/toftrack/{side}/joint/wrist"]]
-        assert wrist == hand["joints_m"][0]
+    for hand in hands:
+        assert found[f"/toftrack/{hand.side}/tracked"] == [("i", 1)]
+        wrist = [value for _, value in found[f"/toftrack/{hand.side}/joint/wrist"]]
+        assert wrist == hand.joints_m[0].tolist()
 
 
 def test_a_bad_setting_is_one_clear_error() -> None:

@@ -1,14 +1,15 @@
-"""Results: the promised files with the promised content, also for a run that ended early."""
+"""Results: the promised files with the promised content, also for a run that ended early, and of
+several hands.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import errno
 import io
 import json
 import math
 import tracemalloc
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +22,9 @@ from toftrack.estimate import Estimate, no_estimate
 from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames import Truth
+from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.lines import LINE_FIELDS, read_lines
+from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, LINE_FIELDS, json_line, read_lines
 from toftrack.output.results import ResultWriter, read_results, read_run_facts
 from toftrack.output.summary import metrics_table
 from toftrack.programs.recover import recover
@@ -45,7 +47,7 @@ def estimate(index: int, **changes: Any) -> Estimate:
         side_probability=1.0,
         gesture="palm",
     )
-    return dataclasses.replace(whole, **changes)
+    return replace(whole, **changes)
 
 
 def write(
@@ -60,6 +62,10 @@ def write(
     return writer
 
 
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "track.jsonl").read_text().splitlines()]
+
+
 def truth_of(estimates: list[Estimate], frames: int) -> Truth:
     joints = np.zeros((frames, 21, 3), np.float32)
     for one in estimates:
@@ -69,50 +75,34 @@ def truth_of(estimates: list[Estimate], frames: int) -> Truth:
 
 def test_track_npz_has_the_promised_keys_shapes_and_types(tmp_path: Path) -> None:
     write(tmp_path, [estimate(i) for i in range(6)])
-    promised = {
-        "joints_m": ((6, 21, 3), "f4"),
-        "lost": ((6,), "?"),
-        "state": ((6, 27), "f4"),
-        "latent": ((6, 4), "f4"),
-        "score": ((6,), "f4"),
-        "covariance": ((6, 10, 10), "f4"),
-        "joint_sigma_m": ((6, 21, 3), "f4"),
-        "joint_confidence": ((6, 21), "f4"),
-        "joint_ok": ((6, 21), "?"),
-        "effective_sample_size": ((6,), "f4"),
-        "gesture_probability": ((6,), "f4"),
-        "pinch": ((6,), "f4"),
-        "pinching": ((6,), "?"),
-        "confidence": ((6,), "f4"),
-        "outside_rad": ((6,), "f4"),
-        "side_probability": ((6,), "f4"),
-        "index": ((6,), "i8"),
-        "pointing_origin_m": ((6, 3), "f4"),
-        "pointing_direction": ((6, 3), "f4"),
-        "landmarks": ((6, 21, 3), "f4"),
-        "openxr_position_m": ((6, 26, 3), "f4"),
-        "openxr_orientation": ((6, 26, 4), "f4"),
-        "openxr_radius_m": ((6, 26), "f4"),
-        "joint_parents": ((21,), "i8"),
-        "openxr_joint_parents": ((26,), "i8"),
-        "timestamp_s": ((6,), "f8"),
-        "compute_s": ((6,), "f4"),
-        "dropped": ((6,), "?"),
+    promised: dict[tuple[str, tuple[int, ...]], str] = {
+        ("f4", (21, 3)): "joints_m joint_sigma_m landmarks",
+        ("f4", (21,)): "joint_confidence",
+        ("f4", (27,)): "state",
+        ("f4", (4,)): "latent",
+        ("f4", (10, 10)): "covariance",
+        ("f4", (3,)): "pointing_origin_m pointing_direction",
+        ("f4", (26, 3)): "openxr_position_m",
+        ("f4", (26, 4)): "openxr_orientation",
+        ("f4", (26,)): "openxr_radius_m",
+        ("f4", ()): "score effective_sample_size gesture_probability pinch confidence outside_rad "
+        "side_probability compute_s",
+        ("f8", ()): "timestamp_s",
+        ("i8", ()): "index",
+        ("?", ()): "lost pinching dropped",
+        ("?", (21,)): "joint_ok",
+        ("U", ()): "gesture state_name side",
     }
+    names = {"joint_names", "openxr_joint_names", "angle_names"}
+    parents = {"joint_parents", "openxr_joint_parents"}
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
-        texts = {
-            "gesture",
-            "state_name",
-            "side",
-            "joint_names",
-            "openxr_joint_names",
-            "angle_names",
-        }
-        assert set(archive.files) == {*promised, *texts, "readme", "metadata"}
-        for name, (shape, kind) in promised.items():
-            assert archive[name].shape == shape, name
-            assert archive[name].dtype == np.dtype(kind), name
-        assert all(archive[name].dtype.kind == "U" for name in texts)
+        every = {name for words in promised.values() for name in words.split()}
+        assert set(archive.files) == every | names | parents | {"readme", "metadata"}
+        for (kind, shape), words in promised.items():
+            for name in words.split():
+                assert archive[name].shape == (6, *shape), name
+                found = archive[name].dtype
+                assert found.kind == "U" if kind == "U" else found == np.dtype(kind), name
         assert archive["joint_names"].tolist() == list(NAMES)
         assert json.loads(archive["metadata"].item()) == {"seed": 1}
 
@@ -172,27 +162,20 @@ def test_frames_without_estimate_are_null_in_lines_and_nan_in_arrays(tmp_path: P
 
     text = (tmp_path / "track.jsonl").read_text()
     first, second = (json.loads(line, parse_constant=refuse) for line in text.splitlines())
-    assert first["joints_m"][0] == [None] * 3
-    assert first["gesture_probability"] is None
-    assert first["lost"] is True
-    assert second["joints_m"][0][0] is not None
+    assert first["joints_m"][0] == [None] * 3 and first["gesture_probability"] is None
+    assert first["lost"] is True and second["joints_m"][0][0] is not None
     content = read_results(tmp_path / "track.npz")
-    assert np.isnan(content["joints_m"][0]).all()
-    assert np.isfinite(content["joints_m"][1]).all()
+    assert np.isnan(content["joints_m"][0]).all() and np.isfinite(content["joints_m"][1]).all()
     json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
 
 
 def test_summary_counts_and_averages(tmp_path: Path) -> None:
     writer = write(tmp_path, [estimate(i) for i in range(5)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary == writer.summary
-    assert summary["frames"] == 5
-    assert summary["lost_frames"] == 1
-    assert summary["mean_ms"] == pytest.approx(30)
-    assert summary["median_ms"] == pytest.approx(30)
-    assert summary["fps"] == pytest.approx(100 / 3)
-    assert summary["mean_score"] == pytest.approx(0.52)
-    assert "metrics" not in summary
+    assert summary == writer.summary and "metrics" not in summary
+    assert (summary["frames"], summary["lost_frames"]) == (5, 1)
+    figures = [summary[name] for name in ("mean_ms", "median_ms", "fps", "mean_score")]
+    assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
 
 
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
@@ -217,11 +200,10 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt):
-        with ResultWriter(tmp_path, {}, NAMES, None) as writer:
-            writer.append((estimate(0),))
-            writer.append((estimate(1),))
-            raise KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt), ResultWriter(tmp_path, {}, NAMES, None) as writer:
+        writer.append((estimate(0),))
+        writer.append((estimate(1),))
+        raise KeyboardInterrupt
     assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
 
@@ -309,7 +291,7 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
         tracemalloc.start()
         with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
             for i in range(frames):
-                writer.append((dataclasses.replace(one, index=i),))
+                writer.append((replace(one, index=i),))
         found = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
         return found
@@ -319,15 +301,22 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     assert many - few < 200 * 200  # a frame's numbers alone are 1100 bytes
 
 
+def recovered(folder: Path, summary: dict[str, Any] | None) -> dict[str, Any]:
+    """What was written, which is recovered from the lines as it was."""
+    before = read_results(folder / "track.npz")
+    for name in ("track.npz", "summary.json"):
+        (folder / name).unlink()
+    assert json.dumps(recover(folder)) == json.dumps(summary)  # NaN, too
+    after = read_results(folder / "track.npz")
+    for name in LINE_FIELDS:
+        np.testing.assert_array_equal(after[name], before[name])
+    return before
+
+
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
     odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
     many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
-    write(tmp_path, many)
-    before = read_results(tmp_path / "track.npz")
-    recover(tmp_path)
-    after = read_results(tmp_path / "track.npz")
-    for name in LINE_FIELDS:
-        np.testing.assert_array_equal(after[name], before[name])
+    recovered(tmp_path, write(tmp_path, many).summary)
 
 
 def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
@@ -337,26 +326,37 @@ def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
             vacant = no_estimate(i, 0.04 * i, "searching", 4, 0.01)
             there = estimate(i, lost=False, side="left")
             writer.append((vacant, there, there if i else vacant))
-    lines = [json.loads(line) for line in (tmp_path / "track.jsonl").read_text().splitlines()]
+    lines = lines_of(tmp_path)
     assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[1], *[[1, 2]] * 3]
-    before = read_results(tmp_path / "track.npz")
-    assert before["joints_m"].shape == (4, 3, 21, 3) and before["timestamp_s"].shape == (4,)
-    assert before["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
-    assert before["side"][3].tolist()[2] == "left" and np.isnan(before["joints_m"][:, 0]).all()
-    recover(tmp_path)
-    after = read_results(tmp_path / "track.npz")
-    for name in LINE_FIELDS:
-        np.testing.assert_array_equal(after[name], before[name])
+    content = recovered(tmp_path, writer.summary)
+    assert content["joints_m"].shape == (4, 3, 21, 3) and content["timestamp_s"].shape == (4,)
+    assert content["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
+    assert content["side"][3, 2] == "left" and np.isnan(content["joints_m"][:, 0]).all()
 
 
-def test_a_line_in_the_middle_that_is_damaged_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "bad", "words"),
+    [
+        (1, "{]", "line 2 of"),
+        (1, '{"index":1}', "shortly before"),
+        (0, {"index": None}, "'index'"),
+        (0, {"joints_m": [[0, 0, 0]]}, "shape"),
+        (0, {"index": 10**19}, "shortly before"),
+    ],
+)
+def test_a_line_that_is_damaged_is_named(
+    tmp_path: Path, number: int, bad: str | dict[str, Any], words: str
+) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"
-    lines = path.read_text().splitlines(keepends=True)
-    for bad, words in (("{]\n", "line 2 of"), ('{"index":1}\n', "shortly before")):
-        path.write_text("".join([lines[0], bad, *lines[2:]]))
-        with pytest.raises(ToftrackError, match=words):
-            recover(tmp_path)
+    lines = path.read_text().splitlines()
+    if isinstance(bad, dict):
+        line = json.loads(lines[number]) | bad
+        bad = json.dumps({k: v for k, v in line.items() if v is not None or k not in bad})
+    lines[number] = bad
+    path.write_text("\n".join(lines) + "\n")
+    with pytest.raises(ToftrackError, match=words):
+        recover(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -377,30 +377,8 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("field", "value", "reported"),
-    [
-        ("index", None, "has no 'index'"),
-        ("joints_m", [[0, 0, 0]], "shape"),
-        ("index", 10**19, "line 1 of"),
-    ],
-)
-def test_a_first_line_that_is_damaged_is_named(
-    tmp_path: Path, field: str, value: object, reported: str
-) -> None:
-    write(tmp_path, [estimate(0)])
-    path = tmp_path / "track.jsonl"
-    line = json.loads(path.read_text())
-    line[field] = value
-    path.write_text(json.dumps({k: v for k, v in line.items() if v is not None or k != field}))
-    with open(path, "a") as stream:
-        stream.write("\n")
-    with pytest.raises(ToftrackError, match=reported):
-        recover(tmp_path)
-
-
 def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(0), dataclasses.replace(estimate(1), index=10**15)])
+    write(tmp_path, [estimate(0), replace(estimate(1), index=10**15)])
     assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
 
 
@@ -421,17 +399,14 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
     summary = write(tmp_path, done, truth).summary
     content = read_results(tmp_path / "track.npz")
-    rows = [2, 3, 3, 3, 6, 7]
-    np.testing.assert_array_equal(
-        content["joints_m"], np.array([estimate(i).joints_m for i in rows])
-    )
+    shown = [estimate(i) for i in (2, 3, 3, 3, 6, 7)]
+    np.testing.assert_array_equal(content["joints_m"], np.array([one.joints_m for one in shown]))
     np.testing.assert_allclose(content["timestamp_s"], np.arange(2, 8) / 25)
     assert content["compute_s"][2:4].tolist() == [0, 0]
     assert content["metadata"]["held_frames"] == [4, 5]
-    assert content["dropped"].tolist() == [False, False, True, True, False, False]
-    reported = ["tracking", "tracking", "dropped", "dropped", "tracking", "tracking"]
-    assert content["state_name"].tolist() == reported
-    assert content["lost"].tolist() == [estimate(i).lost for i in rows]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 3]
+    assert content["state_name"].tolist() == ["tracking"] * 2 + ["dropped"] * 2 + ["tracking"] * 2
+    assert content["lost"].tolist() == [one.lost for one in shown]
     # A dropped frame has no line: its number is missing.
     assert [line["index"] for line in read_lines(tmp_path / "track.jsonl")] == [2, 3, 6, 7]
     assert summary["frames"] == 6
@@ -441,12 +416,8 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
 def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
     metadata = {"K": np.eye(2), "file": Path("a"), "unknown": math.nan, "n": np.int64(3)}
     ResultWriter(tmp_path, metadata, NAMES, None).close()
-    assert read_results(tmp_path / "track.npz")["metadata"] == {
-        "K": [[1, 0], [0, 1]],
-        "file": "a",
-        "unknown": None,
-        "n": 3,
-    }
+    kept = {"K": [[1, 0], [0, 1]], "file": "a", "unknown": None, "n": 3}
+    assert read_results(tmp_path / "track.npz")["metadata"] == kept
 
 
 def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
@@ -488,3 +459,149 @@ def test_arrays_that_do_not_fit_together_are_no_result(
     np.savez(path, **(arrays | changes))
     with pytest.raises(ToftrackError, match=r"is not a track\.npz, or it is damaged"):
         read_results(path)
+
+
+FRAMES = 12
+TWO = {"config": {"hands": 2}}
+
+
+def vacant(index: int) -> Estimate:
+    return no_estimate(index, index / 25, "searching", 4, 0.01)
+
+
+def hand(index: int, slot: int) -> Estimate:
+    of_slot = {"side": ("left", "right")[slot], "gesture": ("palm", "fist")[slot]}
+    of_slot |= {"score": 0.5 + slot / 4, "side_probability": 0.75, "lost": False}
+    return replace(estimate(index + 100 * slot, **of_slot), index=index, timestamp_s=index / 25)
+
+
+def two_hands() -> list[tuple[Estimate, Estimate]]:
+    """Both hands; the second one is not there in frames 0 to 2, and doubted in frame 5."""
+    return [
+        (hand(i, 0), vacant(i) if i < 3 else replace(hand(i, 1), lost=i == 5))
+        for i in range(FRAMES)
+    ]
+
+
+def two_truths() -> Truth:
+    """Both hands 10 mm off in each coordinate, the second one's visible from frame 3 on."""
+    there, yes = np.arange(FRAMES) >= 3, np.ones(FRAMES, bool)
+    joints = [np.stack([hand(i, slot).joints_m + 0.01 for i in range(FRAMES)]) for slot in (0, 1)]
+    return Truth(joints[1], there, yes, other=Truth(joints[0], yes, yes))
+
+
+def write_slots(
+    folder: Path, estimates: list[tuple[Estimate, ...]], known: Truth | None = None
+) -> dict[str, Any]:
+    with ResultWriter(folder, TWO, NAMES, known) as writer:
+        for both in estimates:
+            writer.append(both)
+    assert writer.summary is not None
+    return writer.summary
+
+
+def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path: Path) -> None:
+    write_slots(tmp_path, two_hands())
+    lines = lines_of(tmp_path)
+    assert all(tuple(line) == ("index", "timestamp_s", "compute_s", "hands") for line in lines)
+    assert set(FRAME_FIELDS) | set(HAND_FIELDS) == set(LINE_FIELDS)
+    sides = [[(one["slot"], one["side"]) for one in line["hands"]] for line in lines]
+    assert sides[0] == [(0, "left")] and sides[3] == [(0, "left"), (1, "right")]
+    assert set(lines[3]["hands"][1]) == {"slot", *HAND_FIELDS}
+    assert lines[5]["hands"][1]["lost"] is True, "a doubted hand is listed"
+    assert json.loads(json_line((vacant(7), vacant(7))))["hands"] == []
+    some = json.loads(json_line((vacant(3), hand(3, 1)), ("index", "lost", "gesture")))
+    reported = {"slot": 1, "side": "right", "lost": False, "gesture": "fist"}
+    assert some == {"index": 3, "hands": [reported]}
+
+
+def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_path: Path) -> None:
+    done = two_hands()
+    write_slots(tmp_path, done)
+    content = read_results(tmp_path / "track.npz")
+    for name in FRAME_FIELDS:
+        assert content[name].shape == (FRAMES,), name
+    for name in HAND_FIELDS:
+        assert content[name].shape[:2] == (FRAMES, 2), name
+        for row, slot in ((0, 0), (5, 1), (11, 1)):
+            one = np.asarray(getattr(done[row][slot], name), content[name].dtype)
+            np.testing.assert_array_equal(content[name][row, slot], one, name)
+        empty = content[name][0, 1]
+        if empty.dtype.kind == "f":
+            assert np.isnan(empty).all(), name
+        elif empty.dtype.kind == "U":
+            assert empty == "", name
+    assert content["joints_m"].shape == (FRAMES, 2, 21, 3)
+    assert content["lost"][:3, 1].all() and not content["lost"][:3, 0].any()
+    assert not content["pinching"][0, 1]
+
+
+def test_frames_without_any_hand_are_whole_rows(tmp_path: Path) -> None:
+    """Also where no frame has one: the shapes are as ever."""
+    write_slots(tmp_path / "never", [(vacant(i), vacant(i)) for i in range(3)])
+    write_slots(tmp_path / "none", [])
+    for name, rows in (("never", 3), ("none", 0)):
+        content = read_results(tmp_path / name / "track.npz")
+        assert content["covariance"].shape == (rows, 2, 10, 10)
+        assert content["lost"].all() and np.isnan(content["score"]).all()
+    summary = json.loads((tmp_path / "never" / "summary.json").read_text())
+    assert (summary["lost_frames"], summary["mean_score"]) == (3, None)
+    assert "3, 3 of them lost" in metrics_table(summary)
+
+
+def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
+    write_slots(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)])
+    content = read_results(tmp_path / "track.npz")
+    assert content["metadata"]["held_frames"] == [2, 7]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
+    there = content["state_name"] != ""  # a slot without a hand says nothing
+    assert ((content["state_name"] == "dropped") == content["dropped"][:, None] & there).all()
+    assert there[2].tolist() == [True, False]
+    np.testing.assert_array_equal(content["joints_m"][7], content["joints_m"][6])
+    assert content["lost"][2].tolist() == [False, True]
+
+
+def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
+    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
+        default_hand_shape(0.17 + slot / 100).of_side(("left", "right")[slot]).save(tmp_path / name)
+    summary = write_slots(tmp_path, two_hands())
+    assert (summary["frames"], summary["lost_frames"]) == (FRAMES, 0)
+    first, second = summary["slots"]
+    assert (first["frames"], second["frames"]) == (FRAMES, FRAMES - 3)
+    assert (first["lost_frames"], second["lost_frames"]) == (0, 1)
+    assert (first["mean_score"], second["mean_score"]) == pytest.approx((0.5, 0.75))
+    assert [one["hand"]["side"] for one in (first, second)] == ["left", "right"]
+    assert second["hand"]["length_mm"] == pytest.approx(180)
+    assert "slot 1" in metrics_table(summary)
+
+
+def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
+    known = two_truths()
+    metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
+    content = read_results(tmp_path / "track.npz")
+    assert (metrics["slot"], metrics["second"]["slot"]) == (1, 0)
+    for found, one in ((metrics, known), (metrics["second"], known.other)):
+        assert one is not None
+        joints, lost = content["joints_m"][:, found["slot"]], content["lost"][:, found["slot"]]
+        assert found["trust"] == asdict(trust(judged(joints, lost, one)))
+        figures = evaluate(joints, lost, one)
+        assert {name: found[name] for name in figures} == figures
+        assert found["coverage"]["in_region_90_pct"] == 100
+    assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
+    table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
+    assert "the other hand" in table and table.count("usable") == 2
+
+
+def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
+    summary = write_slots(tmp_path, two_hands(), replace(two_truths(), other=None))
+    assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
+    assert summary["metrics"]["ghost_pct"] == 100
+    assert "another hand, where is none" in metrics_table(summary)
+
+
+def test_a_slot_that_there_is_not_is_a_damaged_line(tmp_path: Path) -> None:
+    write_slots(tmp_path, two_hands())
+    path = tmp_path / "track.jsonl"
+    path.write_text(path.read_text().replace('"slot":1', '"slot":7'))
+    with pytest.raises(ToftrackError, match="not a line of a run"):
+        recover(tmp_path)

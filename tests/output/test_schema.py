@@ -48,8 +48,7 @@ def test_a_line_that_is_none_is_refused(changes: dict[str, Any]) -> None:
 def test_the_schema_has_each_field() -> None:
     parts = SCHEMA["$defs"]
     assert set(parts["frame"]["properties"]) == set(FRAME_FIELDS)
-    # A line may have joint_ok, which older ones do not.
-    assert set(parts["hand"]["properties"]) - {"joint_ok"} == set(HAND_FIELDS) - {"joint_ok"}
+    assert set(parts["hand"]["properties"]) == set(HAND_FIELDS)
     assert set(parts["hand"]["properties"]["state_name"]["enum"]) == set(STATES) - {"dropped"}
 
 

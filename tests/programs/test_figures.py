@@ -189,20 +189,6 @@ def test_lost_frames_are_shown_and_shaded(
         assert share(new, chart.SHADE) > share(old, chart.SHADE) + 0.01, name
 
 
-def test_runs_of_older_versions_are_read_as_well(run: Path) -> None:
-    now = read_run(run)
-    later = {"confidence", "outside_rad", "side", "side_probability"}
-    with np.load(run / "track.npz") as archive:
-        kept = {key: archive[key] for key in archive.files if key not in later}
-    np.savez(run / "track.npz", **kept)
-    old = read_run(run)
-    assert old.state_names == now.state_names and (old.frames == now.frames).all()
-    one, same = now.estimate(3), old.estimate(3)
-    assert (one.index, one.state_name, one.score) == (same.index, same.state_name, same.score)
-    assert one.side == "right" and 0 <= one.confidence <= 1
-    assert same.side == "" and np.isnan(same.confidence)
-
-
 def test_two_hands_have_figures_of_their_own_and_one_filmstrip(
     run: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

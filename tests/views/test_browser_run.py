@@ -67,11 +67,16 @@ def test_with_the_page_recordings_keep_their_pace_and_only_the_sample_repeats() 
     assert not configuration("device=folder", "device.path=x").device.realtime
 
 
+@pytest.fixture
+def clock(monkeypatch) -> list[float]:
+    now = [0.0]
+    monkeypatch.setattr(time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(time, "sleep", lambda s: now.__setitem__(0, now[0] + s))
+    return now
+
+
 @pytest.mark.parametrize("realtime", [False, True])
-def test_a_repeated_recording_counts_on(realtime: bool, monkeypatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(time, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+def test_a_repeated_recording_counts_on(realtime: bool, clock) -> None:
     device = Sample(start=10, stop=13, realtime=realtime, repeat=True)
     assert device.frames is None and device.truth is None and device.description["repeat"]
     frames = list(islice(device, 8))
@@ -83,10 +88,7 @@ def test_a_repeated_recording_counts_on(realtime: bool, monkeypatch) -> None:
     assert device.dropped == 0 and clock[0] == pytest.approx(7 / 25 if realtime else 0, abs=1e-3)
 
 
-def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(monkeypatch) -> None:
-    clock = [0.0]
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    monkeypatch.setattr(time, "sleep", lambda s: clock.__setitem__(0, clock[0] + s))
+def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(clock) -> None:
     device = Replay(ROOT / "toftrack/data/sample.npz", 0, 5, realtime=True, repeat=True)
     indices = []
     for frame in islice(device, 4):
@@ -190,10 +192,8 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
 
         for width in (1200, 500):
             chromium.set_window_size(width, 900)
-            over = (
-                "return document.documentElement.scrollWidth - document.documentElement.clientWidth"
-            )
-            assert chromium.execute_script(over) <= 0
+            wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
+            assert chromium.execute_script(f"return {wide}") <= 0
             clipped = "return [...document.querySelectorAll('dd, #phase')].filter(shown => shown"
             clipped += ".scrollWidth > shown.clientWidth + 1).map(shown => shown.textContent)"
             assert chromium.execute_script(clipped) == []

@@ -18,7 +18,6 @@ from toftrack.errors import ToftrackError
 from toftrack.estimate import Estimate, no_estimate
 from toftrack.frames import Frame
 from toftrack.hand.shape import default_hand_shape
-from toftrack.views.base import TrackedFrame
 from toftrack.views.overlay import (
     CAPTION_PX,
     VideoView,
@@ -58,11 +57,6 @@ def lost_hand() -> Estimate:
     return no_estimate(7, 0.28, "lost", 4, 0.01)
 
 
-def moment() -> TrackedFrame:
-    frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
-    return one_hand(frame, DEPTH, CAMERA, hand(), default_hand_shape())
-
-
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     caption = panel[: panel.shape[0] - scale * H]
     body = panel[caption.shape[0] :]
@@ -77,17 +71,22 @@ def is_grey(picture: np.ndarray) -> bool:
     return bool((picture.max(axis=-1) == picture.min(axis=-1)).all())
 
 
-def other_hand(**changes: object) -> Estimate:
-    """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
-    one = hand()
-    joints = one.joints_m + np.array([-0.1, 0, 0.1], np.float32)
-    reported = {"joints_m": joints, "state": np.zeros(27, np.float32), "side": "left"}
-    return dataclasses.replace(one, **reported | {"side_probability": 0.83} | changes)
-
-
 def present(**changes: object) -> Estimate:
     reported = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
     return dataclasses.replace(hand(), **reported | changes)
+
+
+def other_hand(**changes: object) -> Estimate:
+    """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
+    joints = hand().joints_m + np.array([-0.1, 0, 0.1], np.float32)
+    return present(**{"joints_m": joints, "side": "left", "side_probability": 0.83} | changes)
+
+
+def panel_sides(
+    *estimates: Estimate, amplitude: np.ndarray | None = AMPLITUDE
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of a panel without models: the caption and both sides."""
+    return sides(draw_panel(DEPTH, amplitude, CAMERA, estimates, [None] * len(estimates), 3))
 
 
 def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -97,7 +96,7 @@ def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
-    alone = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (present(),), (None,), 3))[1]
+    alone = panel_sides(present())[1]
     caption, left, right = two(present(), other_hand())
     assert colour_share(left, THUMB) > 1.3 * colour_share(alone, THUMB)
     for rgb in SLOT_RGB[:2]:
@@ -150,7 +149,7 @@ def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
 @pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
 def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
     one = hand()
-    _, left, right = sides(draw_panel(DEPTH, amplitude, CAMERA, (one,), (None,), 3))
+    _, left, right = panel_sides(one, amplitude=amplitude)
     for joint, colour in ((4, THUMB), (2, THUMB), (20, LITTLE), (18, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
@@ -160,11 +159,11 @@ def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None)
 def test_joints_that_are_not_ok_are_hollow_and_their_bones_dashed() -> None:
     ok = np.arange(21) != 4
     one = dataclasses.replace(hand(), joint_ok=ok)
-    _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
+    left = panel_sides(one)[1]
     for joint, colour in ((4, (0, 0, 0)), (20, LITTLE)):
         u, v = np.round((CAMERA.project(one.joints_m[joint]) + 0.5) * 3 - 0.5).astype(int)
         np.testing.assert_allclose(left[v, u], colour, atol=2)
-    whole = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (None,), 3))[1]
+    whole = panel_sides(hand())[1]
     assert 0 < colour_share(left, THUMB) < colour_share(whole, THUMB)
     assert colour_share(left, LITTLE) == colour_share(whole, LITTLE)
     along = np.linspace(one.joints_m[3], one.joints_m[4], 40)[10:30]
@@ -179,8 +178,7 @@ def test_no_skeleton_without_an_estimate_behind_the_camera_or_far_outside_the_im
     away = hand().joints_m + np.array([1e6, 0, 0], np.float32)
     outside = dataclasses.replace(hand(), joints_m=away)
     for one in (dataclasses.replace(lost_hand(), lost=False), behind, outside):
-        _, left, _ = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one,), (None,), 3))
-        assert is_grey(left)
+        assert is_grey(panel_sides(one)[1])
 
 
 def test_range_image_is_darker_where_nearer_on_white() -> None:
@@ -198,8 +196,7 @@ def test_range_image_is_darker_where_nearer_on_white() -> None:
 def test_lost_is_red_and_tracking_is_not() -> None:
     red = (40, 40, 220)
     for lost in (True, False):
-        panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(lost),), (None,), 3)
-        caption, left, right = sides(panel)
+        caption, left, right = panel_sides(hand(lost))
         assert (colour_share(caption, red) > 0.5) == lost
         assert (colour_share(left[:, :3], red) > 0.9) == lost
         assert (colour_share(right[:, -3:], red) > 0.9) == lost
@@ -255,29 +252,18 @@ def test_video_has_every_panel_at_the_rate(tmp_path: Path) -> None:
         for i in range(30):
             view.add(panel_of(8 * i))
     frames, fps = read_video(tmp_path / "overlay.mp4")
-    assert fps == pytest.approx(12.5)
-    assert len(frames) == 30
-    for i, frame in enumerate(frames):
-        assert frame.shape == (96, 160, 3)
-        assert abs(float(frame.mean()) - 8 * i) < 6
+    assert fps == pytest.approx(12.5) and {frame.shape for frame in frames} == {(96, 160, 3)}
+    assert [frame.mean() for frame in frames] == pytest.approx([8 * i for i in range(30)], abs=6)
 
 
 @pytest.mark.parametrize("fps", [29.97002997, 1e-3, 5000.0, math.nan])
-def test_odd_rates_give_a_readable_video(tmp_path: Path, fps: float) -> None:
+def test_odd_rates_and_sizes_give_a_readable_video(tmp_path: Path, fps: float) -> None:
+    """Panels of other and odd sizes share an even one."""
     with VideoView(tmp_path, fps, None) as view:
-        view.add(panel_of(10))
-        view.add(panel_of(20))
-    frames, found = read_video(tmp_path / "overlay.mp4")
-    assert len(frames) == 2
-    assert 1 <= found <= 120
-
-
-def test_panels_of_other_and_odd_sizes_share_one_even_size(tmp_path: Path) -> None:
-    with VideoView(tmp_path, 25, None) as view:
         view.add(panel_of(10, (97, 161)))
         view.add(panel_of(20, (200, 300)))
-    frames, _ = read_video(tmp_path / "overlay.mp4")
-    assert [frame.shape for frame in frames] == [(96, 160, 3)] * 2
+    frames, found = read_video(tmp_path / "overlay.mp4")
+    assert [frame.shape for frame in frames] == [(96, 160, 3)] * 2 and 1 <= found <= 120
 
 
 @pytest.mark.parametrize(("count", "known"), [(10, True), (100, False), (1000, True), (700, False)])
@@ -316,9 +302,9 @@ def test_a_video_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_tracked_frame_is_appended_as_its_panel(tmp_path: Path) -> None:
+    frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
     with VideoView(tmp_path, 25, 2) as view:
-        view.show(moment())
+        view.show(one_hand(frame, DEPTH, CAMERA, hand(), default_hand_shape()))
         assert not view.commands()
     assert (tmp_path / "overlay.mp4").stat().st_size > 0
-    strip = cv2.imread(str(tmp_path / "overlay.png"))
-    assert strip is not None and colour_share(strip, THUMB) > 0
+    assert colour_share(cv2.imread(str(tmp_path / "overlay.png")), THUMB) > 0

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.configured import f_measure
-from helpers.moments import one_hand, two_hands, with_hand
+from helpers.moments import tracked, two_hands, with_hand
 from helpers.tracking import configuration, make_tracker
 from hydra.utils import instantiate
 
-import toftrack.views.rerun
+import toftrack.views
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
@@ -29,13 +29,14 @@ from toftrack.views.classified import classify
 
 QUICK = ("filter.particles=100",)
 FRAMES = 6
+NAN = np.full(27, np.nan, np.float32)
 
 
 def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
-    for name in ("view", "entities"):  # another test may have imported them
-        monkeypatch.delitem(sys.modules, f"toftrack.views.rerun.{name}", raising=False)
-        monkeypatch.delattr(toftrack.views.rerun, name, raising=False)
+    # Another test may have imported it.
+    monkeypatch.delitem(sys.modules, "toftrack.views.rerun", raising=False)
+    monkeypatch.delattr(toftrack.views, "rerun", raising=False)
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
     assert "needs the package rerun-sdk" in sentence(error.value)
@@ -52,7 +53,7 @@ def test_other_views_import_neither_rerun_nor_matplotlib() -> None:
 def rerun_view():
     """The module, where rerun-sdk is installed."""
     pytest.importorskip("rerun", reason="rerun-sdk is not installed (pip install -e '.[rerun]')")
-    from toftrack.views.rerun import view as rerun_view
+    from toftrack.views import rerun as rerun_view
 
     return rerun_view
 
@@ -60,24 +61,12 @@ def rerun_view():
 @cache
 def moments() -> tuple[TrackedFrame, ...]:
     """Six tracked frames; then one without an estimate, and one where nothing is in range."""
-    tracker, device = make_tracker(*QUICK), Sample(stop=FRAMES)
-    tracked = []
-    for frame in device:
-        depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
-        estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        tracked.append(
-            one_hand(frame, depth, device.camera, estimate, shape, tracker.hands.insights[0])
-        )
-    last = tracked[-1].estimates[0]
-    nan = dataclasses.replace(
-        last, index=6, timestamp_s=0.24, state=np.full(27, np.nan, np.float32), lost=True
-    )
+    frames = tracked(Sample(stop=FRAMES), make_tracker(*QUICK))
+    last = frames[-1].estimates[0]
+    nan = dataclasses.replace(last, index=6, timestamp_s=0.24, state=NAN, lost=True)
     gone = dataclasses.replace(last, index=7, timestamp_s=0.28, lost=True, score=0.0)
-    return (
-        *tracked,
-        with_hand(tracked[-1], estimate=nan),
-        with_hand(tracked[-1], estimate=gone, insight=None),
-    )
+    without = with_hand(frames[-1], estimate=gone, insight=None)
+    return *frames, with_hand(frames[-1], estimate=nan), without
 
 
 @pytest.fixture
@@ -119,18 +108,19 @@ def test_the_file_passes_reruns_own_check(written: Path) -> None:
 def test_every_frames_estimate_can_be_read_back(written: Path) -> None:
     joints = rows(written, "world/hand/joints", "Points3D:positions")
     assert sorted(joints) == [0, 1, 2, 3, 4, 5, 7]  # frame 6 has no estimate
-    scores = rows(written, "plots/score", "Scalars:scalars")
-    latent = rows(written, "plots/latent", "Scalars:scalars")
-    pinches = rows(written, "plots/pinch", "Scalars:scalars")
-    times = rows(written, "plots/time", "Scalars:scalars")
-    for moment in moments():
-        estimate = moment.estimates[0]
+    plots = {
+        name: rows(written, f"plots/{name}", "Scalars:scalars")
+        for name in ("score", "latent", "pinch", "time")
+    }
+    for estimate in (moment.estimates[0] for moment in moments()):
         number = estimate.index
-        reported = [estimate.score, estimate.confidence, float(estimate.lost)]
-        assert scores[number] == pytest.approx(reported, nan_ok=True)
-        assert pinches[number] == pytest.approx([estimate.pinch], nan_ok=True)
-        assert latent[number] == pytest.approx(estimate.latent)
-        assert times[number] == pytest.approx(1e3 * estimate.compute_s)
+        for name, values in {
+            "score": [estimate.score, estimate.confidence, float(estimate.lost)],
+            "latent": estimate.latent,
+            "pinch": [estimate.pinch],
+            "time": [1e3 * estimate.compute_s],
+        }.items():
+            assert plots[name][number] == pytest.approx(values, nan_ok=True), name
         if number != 6:
             np.testing.assert_allclose(joints[number], estimate.joints_m, atol=1e-6)
     colours = rows(written, "world/hand/ellipsoids", "Ellipsoids3D:colors")
@@ -153,7 +143,7 @@ def test_depth_comes_back_in_metres_and_with_its_pinhole(written: Path) -> None:
 def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
     labels = rows(written, "world/tracker/classified", "SegmentationImage:buffer")
     segments = rows(written, "world/tracker/segmentation", "SegmentationImage:buffer")
-    for moment in (tracked.hands[0] for tracked in moments()[:FRAMES]):
+    for moment in (frame.hands[0] for frame in moments()[:FRAMES]):
         seen = moment.insight.observation
         pixels = classify(moment.estimate.state, moment.shape, seen, f_measure()).labels()
         np.testing.assert_array_equal(labels[moment.estimate.index].reshape(144, 176), pixels)
@@ -179,15 +169,9 @@ def test_particles_lie_around_the_hand_brighter_with_weight(written: Path) -> No
 def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> None:
     """It goes after the first frame."""
     both = two_hands(moments()[5])
-    nan = np.full(27, np.nan, np.float32)
-    gone = two_hands(dataclasses.replace(moments()[7]), lost=True)
-    vacant = dataclasses.replace(gone.estimates[1], state=nan)
-    gone = dataclasses.replace(
-        gone, hands=(gone.hands[0], dataclasses.replace(gone.hands[1], estimate=vacant))
-    )
     with rerun_view.RerunView(tmp_path, 25.0, 2, likelihood=f_measure()) as view:
         view.show(both)
-        view.show(gone)
+        view.show(two_hands(moments()[7], lost=True, state=NAN))
     path = tmp_path / "track.rrd"
     joints = rows(path, "world/hand_2/joints", "Points3D:positions")
     np.testing.assert_allclose(joints[5], both.estimates[1].joints_m, atol=1e-6)
@@ -204,27 +188,31 @@ def test_a_folder_that_cannot_be_written_is_reported(rerun_view, tmp_path: Path)
         rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())
 
 
-def test_addresses_without_a_viewer_are_reported(rerun_view, tmp_path: Path) -> None:
-    def connect(address: str) -> None:
-        rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect=address)
-
-    for address in ("nonsense", "http://127.0.0.1:9876", "rerun+http://127.0.0.1:port/proxy"):
-        with pytest.raises(ToftrackError, match="no address of a viewer"):
-            connect(address)
+def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    with pytest.raises(ToftrackError, match="no viewer answers"):
-        connect(f"rerun+http://127.0.0.1:{port}/proxy")
-    with pytest.raises(ToftrackError, match="exclude each other"):
-        rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), connect="x", spawn=True)
+        return probe.getsockname()[1]
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"connect": "nonsense"}, "no address of a viewer"),
+        ({"connect": "http://127.0.0.1:9876"}, "no address of a viewer"),
+        ({"connect": "rerun+http://127.0.0.1:port/proxy"}, "no address of a viewer"),
+        ({"connect": "rerun+http://127.0.0.1:FREE/proxy"}, "no viewer answers"),
+        ({"connect": "x", "spawn": True}, "exclude each other"),
+    ],
+)
+def test_addresses_without_a_viewer_are_reported(rerun_view, tmp_path, settings, words) -> None:
+    settings["connect"] = settings["connect"].replace("FREE", str(free_port()))
+    with pytest.raises(ToftrackError, match=words):
+        rerun_view.RerunView(tmp_path, 25.0, likelihood=f_measure(), **settings)
 
 
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_viewer_is_sent_the_same(rerun_view, tmp_path: Path) -> None:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = free_port()
     received = tmp_path / "received.rrd"
     # Rerun's own server, which keeps what it receives instead of showing it.
     server = subprocess.Popen(

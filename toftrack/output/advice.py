@@ -39,44 +39,36 @@ _FEWEST_FRAMES = 20
 
 @dataclass(frozen=True)
 class LostFrame:
-    """What was seen in a frame that was lost.
-
-    read: share of pixels with a reading.  within: share of pixels with one within reach.
-    nearest_m, farthest_m: between which nearly all readings lie; NaN without any.
-    hand_px: pixels that were taken for the hand; 0 where nothing was.
-    other_side: whether it looks rather like the other hand; None where nobody says.
-    apparent_m: how long the hand seemed, from wrist to middle fingertip; None where nobody says.
-    """
+    """What was seen in a frame that was lost."""
 
     state_name: str
     read: float
+    """Share of pixels with a reading."""
     within: float
+    """Share of pixels with one within reach."""
     nearest_m: float
     farthest_m: float
+    """Between these nearly all readings lie; NaN without any."""
     hand_px: int
+    """That were taken for the hand."""
     other_side: bool | None
+    """It looks rather like the other hand; None where nobody says."""
     apparent_m: float | None = None
+    """How long the hand seemed, from wrist to middle fingertip; None where nobody says."""
 
 
 @dataclass
 class RunFacts:
-    """What is known of a run's lost frames.
-
-    counts: numbers of frames: all (`frames`), `lost` ones, and of these those in which nothing was
-        within segmentation.max_distance_m (`out_of_reach`), something too near to be measured well
-        (`too_near`), something taken for a hand (`with_hand`) that had too few pixels (`small`), in
-        which the networks said which hand it looked like (`judged`), the other one (`other_side`),
-        or how long it looked (`detections`); `tracked_judged`, `tracked_other_side`: the same of
-        frames that were not lost.
-    states: lost frames by state name.
-    read, apparent_m: sums of the shares of pixels with a reading, and of how long the hand looked.
-    nearest_m, farthest_m: between which nearly all readings of all lost frames lie.
-    """
+    """What is known of a run's lost frames; nearly all their readings lie between two distances."""
 
     counts: Counter[str] = field(default_factory=Counter)
+    """Frames of each kind, see add_lost and add_tracked."""
     states: Counter[str] = field(default_factory=Counter)
+    """Lost frames by state name."""
     read: float = 0.0
+    """Sum of the shares of pixels with a reading."""
     apparent_m: float = 0.0
+    """Sum of how long the hand looked."""
     nearest_m: float = math.inf
     farthest_m: float = -math.inf
 
@@ -116,14 +108,12 @@ class RunFacts:
 def lost_frame(
     estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None, reach_m: float
 ) -> LostFrame:
-    """The facts of a lost frame.
-
-    depth_m: (H, W) metres.  insight: of the tracker.  reach_m: nothing beyond is a hand.
-    """
+    """The facts of a lost frame; depth_m (H, W) metres, beyond reach_m nothing is a hand."""
     step = max(1, round(math.sqrt(depth_m.size / _INSPECTED_PX)))
     few = depth_m[::step, ::step]
     readings = few[np.isfinite(few) & (few > 0)]
     nearest, farthest = np.percentile(readings, (2, 98)) if len(readings) else (np.nan, np.nan)
+    detection = None if insight is None else insight.detection
     return LostFrame(
         state_name=estimate.state_name,
         read=len(readings) / few.size,
@@ -132,7 +122,9 @@ def lost_frame(
         farthest_m=float(farthest),
         hand_px=0 if insight is None else int(insight.observation.hand.sum()),
         other_side=_other_side(insight),
-        apparent_m=_apparent_m(insight),
+        apparent_m=None
+        if detection is None or detection.present < _PRESENT
+        else detection.length_m,
     )
 
 
@@ -142,16 +134,9 @@ def _other_side(insight: StepInfo | None) -> bool | None:
     return None if features is None else features.other_side > math.log(2)
 
 
-def _apparent_m(insight: StepInfo | None) -> float | None:
-    detection = None if insight is None else insight.detection
-    return None if detection is None or detection.present < _PRESENT else detection.length_m
-
-
 class Watch:
-    """Gathers the facts of a run, of each slot apart.
-
-    reach_m: nothing beyond is a hand.  facts: of the slots.
-    recent: likewise, of the newest whole stretch of frames, for who watches a run.
+    """Gathers the facts of a run, of each slot apart, and in `recent` those of the newest whole
+    stretch of frames, for who watches a run; beyond reach_m nothing is a hand.
     """
 
     def __init__(self, reach_m: float, slots: int = 1) -> None:
@@ -210,7 +195,6 @@ def advice(facts: RunFacts, side: str | None, reach_m: float) -> tuple[str, ...]
     """At most three sentences: what was seen and what to try; none for a run that went well.
 
     side: of the hand that was looked for; None where either was.
-    reach_m: segmentation.max_distance_m.
     """
     counts = facts.counts
     if counts["lost"] <= _MOST * counts["frames"]:
@@ -238,7 +222,6 @@ def _seen(facts: RunFacts) -> str:
 
 def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     """What to try, the most telling first."""
-
     counts = facts.counts
 
     def mostly(what: str, of: str = "lost") -> bool:

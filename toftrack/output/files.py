@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import io
-import os
+import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -15,9 +14,6 @@ from toftrack.safe_files import check_replaceable, lock, open_in_place, open_to_
 
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
-
-
-_BLOCK = 65536
 WHOLE_FILES = (
     *("run.json", "track.npz", "summary.json", "overlay.png"),
     *("hand_shape.json", "hand_shape_2.json"),
@@ -31,16 +27,10 @@ class LineFile:
     """The growing file of a run's folder, which it locks: the folder has one writer at a time.
 
     A line is in the file as a whole or not at all, unless the process is killed within it. The lock
-    goes with the process, however that ends.
+    goes with the process, however that ends. What was in the file stays there until `clear`.
 
-    What was in the file stays there until `clear`.
-
-    Args:
-        folder: exists.
-
-    Raises:
-        ToftrackError: another run is writing into the folder.
-        OSError: the file cannot be opened, or (by `append`) not be written.
+    Raises ToftrackError: another run is writing into the folder; OSError: the file cannot be
+    opened, or (by `append`) not be written.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -97,21 +87,9 @@ def cut_unfinished_line(folder: Path) -> None:
     if (folder / LINES).stat().st_nlink > 1:
         return
     with open_in_place(folder / LINES, make=False) as file:
-        if whole := _size_of_lines(file):
-            file.truncate(whole)
-
-
-def _size_of_lines(file: io.FileIO) -> int:
-    """Bytes up to the end of the last whole line."""
-    end = file.seek(0, os.SEEK_END)
-    while end > 0:
-        begin = max(0, end - _BLOCK)
-        file.seek(begin)
-        found = file.read(end - begin).rfind(b"\n")
-        if found >= 0:
-            return begin + found + 1
-        end = begin
-    return 0
+        with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as lines:
+            whole = lines.rfind(b"\n") + 1
+        file.truncate(whole)
 
 
 def _lock(file: IO[bytes], folder: Path) -> None:

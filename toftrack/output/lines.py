@@ -34,21 +34,9 @@ KINDS: dict[str, type] = {
     field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
 }
 """Of what type each field is in track.npz; arrays have their shape behind the frames' axis."""
-NUMBERS = frozenset(
-    name for name, hint in _HINTS.items() if hint not in (np.ndarray, ArrayOnDemand)
-)
-"""The fields that are one number or text."""
-
 _FIRST = (
-    "index",
-    "timestamp_s",
-    "state_name",
-    "lost",
-    "confidence",
-    "outside_rad",
-    "side",
-    "side_probability",
-    "score",
+    *("index", "timestamp_s", "state_name", "lost", "confidence", "outside_rad", "side"),
+    *("side_probability", "score"),
 )
 LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
 """What a line of track.jsonl says, fields of Estimate, in their order."""
@@ -58,35 +46,18 @@ DROPPED = "dropped"
 """The array of track.npz that says which frames a live run did not track, and what their
 `state_name` is; they have no line, and their numbers are missing among those of the lines."""
 HAND_FIELDS = tuple(name for name in LINE_FIELDS if name not in FRAME_FIELDS)
-FROM_THE_START = (
-    "index",
-    "state_name",
-    "joints_m",
-    "lost",
-    "state",
-    "latent",
-    "score",
-    "covariance",
-    "effective_sample_size",
-    "gesture",
-    "gesture_probability",
-    "timestamp_s",
-    "compute_s",
-)
-"""What every run says; older ones without the other fields are results as well."""
 SHAPES: dict[str, tuple[int, ...]] = {
     "joints_m": (21, 3),
     "state": (27,),
     "joint_ok": (21,),
-    **dict.fromkeys(NUMBERS, ()),
+    **{name: () for name, hint in _HINTS.items() if hint not in (np.ndarray, ArrayOnDemand)},
 }
 """Of the fields of a hand whose shape does not depend on the run."""
 
 
 def json_line(estimates: Sequence[Estimate], names: Sequence[str] = LINE_FIELDS) -> str:
-    """A frame's estimates, one a slot, as one line of strict JSON, without newline.
-
-    names: which of LINE_FIELDS, in this order.
+    """A frame's estimates, one a slot, as one line of strict JSON, without newline, with some of
+    LINE_FIELDS, in this order.
     """
     content = line_content(estimates, names)
     return json.dumps(content, allow_nan=False, separators=(",", ":"))

@@ -9,6 +9,8 @@ import math
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import numpy as np
+
 from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
@@ -67,10 +69,7 @@ class OscStream(UdpStream):
 
 
 def messages(line: dict[str, Any], parts: Sequence[str]) -> Iterator[Message]:
-    """What is said of a frame, in order.
-
-    line: as in track.jsonl, with the fields of one hand or with `hands`.
-    """
+    """What is said of a frame, in order; line: as in track.jsonl, of one hand or with `hands`."""
     yield "/toftrack/frame", [("i", line["index"]), ("d", line["timestamp_s"])]
     for hand in hands_of(line):
         yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}", parts)
@@ -90,28 +89,22 @@ def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Itera
     # One that a joint's doubt has ended is told, too, or a receiver would hold it for ever.
     if hand["pinch"] is not None or not all(hand["joint_ok"]):
         yield f"{root}/pinch", [("f", hand["pinch"] or 0.0), ("i", int(hand["pinching"]))]
-    ray = [*hand["pointing_origin_m"], *hand["pointing_direction"]]
-    if _finite(ray):
-        yield f"{root}/pointing", _floats(ray)
-    if "joints" in parts:
-        yield from _listed(f"{root}/joint", JOINT_NAMES, hand["joints_m"])
-    if "landmarks" in parts:
-        yield from _listed(f"{root}/landmark", JOINT_NAMES, hand["landmarks"])
-    if "openxr" in parts:
-        columns = (hand[name] for name in _FIELDS_OF["openxr"])
-        rows = [[*at, *turned, radius] for at, turned, radius in zip(*columns, strict=True)]
-        yield from _listed(f"{root}/openxr", OPENXR_JOINT_NAMES, rows)
+    yield from _floats(
+        f"{root}/pointing", [*hand["pointing_origin_m"], *hand["pointing_direction"]]
+    )
+    for part, name, names in (
+        ("joints", "joint", JOINT_NAMES),
+        ("landmarks", "landmark", JOINT_NAMES),
+        ("openxr", "openxr", OPENXR_JOINT_NAMES),
+    ):
+        if part in parts:
+            for joint, *row in zip(
+                names, *(hand[field] for field in _FIELDS_OF[part]), strict=True
+            ):
+                yield from _floats(f"{root}/{name}/{joint}", np.hstack(row).tolist())
 
 
-def _listed(root: str, names: Sequence[str], rows: Sequence[Sequence[Any]]) -> Iterator[Message]:
-    for name, row in zip(names, rows, strict=True):
-        if _finite(row):
-            yield f"{root}/{name}", _floats(row)
-
-
-def _floats(values: Sequence[float]) -> list[tuple[str, Any]]:
-    return [("f", value) for value in values]
-
-
-def _finite(values: Sequence[float | None]) -> bool:
-    return all(value is not None and math.isfinite(value) for value in values)
+def _floats(address: str, values: Sequence[float | None]) -> Iterator[Message]:
+    """A message of numbers, where all of them are known."""
+    if all(value is not None and math.isfinite(value) for value in values):
+        yield address, [("f", value) for value in values]

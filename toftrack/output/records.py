@@ -12,9 +12,10 @@ that of the frames. A slot without a hand is lost, its numbers are NaN, its text
 from __future__ import annotations
 
 import itertools
+import math
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, Self
 
@@ -27,10 +28,8 @@ from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_PARENTS
 from toftrack.output.lines import (
     FRAME_FIELDS,
-    FROM_THE_START,
     HAND_FIELDS,
     KINDS,
-    SHAPES,
     damaged,
     read_lines,
 )
@@ -46,51 +45,49 @@ _SOON_S = 2.0
 class Records:
     """The frames of a run, for a `with`; each field is a column.
 
-    folder: exists; where the records are kept, under no name.
-    like: what a line says of a hand, or of a frame of one; tells the fields and their shapes.
-    slots: of each frame; of several, a line has `hands`.
+    They are kept in the folder, under no name. latent_size: of the pose space.  slots: of each
+    frame; of several, a line has `hands`.
 
     Raises OSError (by `append`, too) when the records cannot be kept there.
     """
 
-    def __init__(self, folder: Path, like: Mapping[str, Any], slots: int) -> None:
+    def __init__(self, folder: Path, latent_size: int, slots: int) -> None:
         self.slots, self.count = slots, 0
         self._words: dict[str, int] = {}
-        self._vacant = _vacant(like)
-        frame = dict.fromkeys(FRAME_FIELDS, 0)
-        self._kind = _record_kind(like if slots == 1 else self._side_by_side(frame | {"hands": []}))
+        unknown = dict.fromkeys(("score", "confidence", "effective_sample_size"), math.nan)
+        vacant = no_estimate(0, 0, "", latent_size, 0).updated(**unknown).values()
+        self._vacant = {name: vacant[name] for name in HAND_FIELDS}
+        of_slots = (slots,) if slots > 1 else ()
+        axes = {name: of_slots if name in HAND_FIELDS else () for name in KINDS}
+        self._kind = np.dtype(  # texts are numbers of words
+            [
+                (name, np.int32 if kind is np.str_ else kind, axes[name] + np.shape(vacant[name]))
+                for name, kind in KINDS.items()
+            ]
+        )
         self._file: IO[bytes] = tempfile.TemporaryFile(dir=folder)  # noqa: SIM115
 
     @classmethod
-    def of_lines(cls, lines: Path, latent_size: int = 4, slots: int = 1) -> Records:
+    def of_lines(cls, lines: Path, latent_size: int, slots: int) -> Records:
         """The records of a track.jsonl, which is read at once.
-
-        latent_size: of the columns of a file without a hand.  slots: of the run.
 
         Raises ToftrackError for a damaged line, OSError when the lines cannot be read.
         """
-        like = next(read_lines(lines), None)
-        if slots > 1:  # which fields there are, any hand says
-            like = next((hand for line in read_lines(lines) for hand in _hands(line)), None)
         with open_to_read(lines) as stream:
             count = sum(1 for _ in stream)
-        last = 1
+        records, last = cls(lines.parent, latent_size, slots), 0
         try:
-            like = like or no_estimate(0, 0, "", latent_size, 0).values()
-            _check(like, set(FROM_THE_START) - set(FRAME_FIELDS if slots > 1 else ()))
-            records = cls(lines.parent, like, slots)
-            try:
-                read = read_lines(lines)
-                with _bar("reading the lines", count) as bar:
-                    while piece := list(itertools.islice(read, _PIECE)):
-                        last = records.count + len(piece)
-                        records._keep(piece)
-                        bar.update(len(piece))
-            except BaseException:
-                records.close()
-                raise
-        except (ArithmeticError, LookupError, TypeError, ValueError) as error:
-            raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
+            read = read_lines(lines)
+            with _bar("reading the lines", count) as bar:
+                while piece := list(itertools.islice(read, _PIECE)):
+                    last += len(piece)
+                    records._keep(piece)
+                    bar.update(len(piece))
+        except BaseException as error:
+            records.close()
+            if isinstance(error, (ArithmeticError, LookupError, TypeError, ValueError)):
+                raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
+            raise
         return records
 
     def append(self, estimates: Sequence[Estimate]) -> None:
@@ -111,18 +108,11 @@ class Records:
     def __exit__(self, *exception: object) -> None:
         self.close()
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of the columns."""
-        return self._kind.names or ()
-
     def column(self, name: str, rows: np.ndarray | None = None) -> np.ndarray:
         """A whole column, or its rows (not decreasing); texts as texts."""
         rows = np.arange(self.count) if rows is None else rows
-        kind = self.kind(name)
-        pieces = [piece for piece in self.pieces(name, rows)]
-        shape = self._kind[name].shape
-        return np.concatenate(pieces) if pieces else np.zeros((0, *shape), kind)
+        nothing = np.zeros((0, *self.shape(name)), self.kind(name))
+        return np.concatenate((nothing, *self.pieces(name, rows)))
 
     def pieces(self, name: str, rows: np.ndarray) -> Iterator[np.ndarray]:
         """Some rows (not decreasing) of a column, in pieces."""
@@ -153,7 +143,7 @@ class Records:
         if self.slots > 1:
             lines = [self._side_by_side(line) for line in lines]
         records = np.zeros(len(lines), self._kind)
-        for name in self.names:
+        for name in KINDS:
             values = [line[name] for line in lines]
             if KINDS[name] is np.str_:
                 values = [self._number(word) for word in values]
@@ -161,7 +151,9 @@ class Records:
                 array = np.array(values, self._kind[name].base)
             if array.dtype.kind == "f":
                 array[np.isinf(array)] = np.nan  # as in the lines
-            records[name] = array.reshape(len(lines), *self._kind[name].shape)
+            if array.shape != records[name].shape:
+                raise ValueError(f"{name!r} has the shape {array.shape[1:]}")
+            records[name] = array
         self._file.write(records.tobytes())
         self.count += len(lines)
 
@@ -180,46 +172,6 @@ class Records:
         return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
 
 
-def _check(hand: Mapping[str, Any], needed: Set[str]) -> None:
-    """ValueError where what a line says of a hand lacks a field, or has one of another shape."""
-    for name in KINDS:
-        if name in hand:
-            shape = np.shape(hand[name])
-            if shape != SHAPES.get(name, shape):
-                raise ValueError(f"{name!r} has the shape {shape}")
-        elif name in needed:
-            raise ValueError(f"it has no {name!r}")
-
-
-def _hands(line: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Those of a line that is of several; none of another one, which is reported later."""
-    hands = line.get("hands")
-    reported = hands if isinstance(hands, list) else []
-    return [hand for hand in reported if isinstance(hand, dict)]
-
-
-def _vacant(hand: Mapping[str, Any]) -> dict[str, Any]:
-    """What stands where a slot has no hand, with the fields and shapes of one that there is."""
-
-    def nothing(name: str) -> Any:
-        if KINDS[name] is np.bool_:
-            return np.full(np.shape(hand[name]), name == "lost").tolist()
-        return "" if KINDS[name] is np.str_ else np.full(np.shape(hand[name]), np.nan).tolist()
-
-    return {name: nothing(name) for name in HAND_FIELDS if name in hand}
-
-
-def _record_kind(line: Mapping[str, Any]) -> np.dtype:
-    """Texts are numbers of words; fields of another version are left out."""
-    return np.dtype(
-        [
-            (name, np.int32 if kind is np.str_ else kind, np.shape(line[name]))
-            for name, kind in KINDS.items()
-            if name in line
-        ]
-    )
-
-
 def write_results(
     path: Path,
     records: Records,
@@ -231,7 +183,7 @@ def write_results(
 
     rows: not decreasing.  changed: arrays in place of columns.  small: further arrays.
     """
-    names = [name for name in records.names if name not in changed]
+    names = [name for name in KINDS if name not in changed]
     with _bar("writing the results", len(rows)) as bar:
 
         def pieces(name: str) -> Iterator[np.ndarray]:
@@ -265,9 +217,8 @@ metadata is JSON."""
 
 
 def facts_for_readers(metadata: dict[str, Any]) -> dict[str, np.ndarray]:
-    """Arrays beside those of the frames: names, skeletons, camera, and a text that explains them.
-
-    metadata: of the run; a camera that it does not tell is left out.
+    """Arrays beside those of the frames: skeletons, a text that explains them, and the camera where
+    the run's metadata tell it.
     """
     facts = {
         "readme": np.array(_README),

@@ -25,7 +25,6 @@ from toftrack.json_text import parse_json, read_json
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
 from toftrack.output.lines import (
     DROPPED,
-    FROM_THE_START,
     HAND_FIELDS,
     KINDS,
     SHAPES,
@@ -52,16 +51,11 @@ class ResultWriter:
     row for every frame of the input nevertheless: a dropped frame repeats the newest estimate there
     was, with no time spent on it, and `dropped` and the state's name say so.
 
-    Args:
-        folder: made when it does not exist; locked until the writer is closed. The results of an
-            earlier run in it go.
-        metadata: facts about the run, JSON-able, for `run.json` and `track.npz`.
-        joint_names: the 21 names, in the order of the joints.
-        truth: ground truth; adds `metrics` to the summary.
+    The folder is made, and locked until the writer is closed; the results of an earlier run in it
+    go. metadata: facts about the run, JSON-able.  truth: adds `metrics` to the summary.
 
-    Raises:
-        ToftrackError: the folder cannot be made or written, another run is writing into it, it has
-            files of these names that are no run's, or a file in it cannot be written.
+    Raises ToftrackError: the folder, or a file in it, cannot be written, another run is writing
+    into it, or it has files of these names that are no run's.
     """
 
     def __init__(
@@ -108,24 +102,18 @@ class ResultWriter:
         self._closed = False
 
     def append(self, estimates: Sequence[Estimate]) -> None:
-        """Write the line of a frame, of which there is an estimate for each slot, to disk.
-
-        Raises ToftrackError if it cannot be written.
-        """
+        """Write the line of a frame, with an estimate for each slot, to disk; or ToftrackError."""
         try:
             self._lines.append(json_line(estimates))
             if self._records is None:
-                self._records = Records(self.folder, estimates[0].values(), len(estimates))
+                self._records = Records(self.folder, estimates[0].latent.size, len(estimates))
             self._records.append(estimates)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
         self.frames += 1
 
     def close(self) -> None:
-        """Write track.npz and summary.json; a second call does nothing.
-
-        Raises ToftrackError when they cannot be written.
-        """
+        """Write track.npz and summary.json, or ToftrackError; a second call does nothing."""
         if self._closed:
             return
         self._closed = True
@@ -148,10 +136,7 @@ class ResultWriter:
 
 
 def records_of(folder: Path, facts: dict[str, Any]) -> Records:
-    """The records of a run's lines, which take a while to read.
-
-    folder, facts: as for `finish`.  Raises ToftrackError for damaged lines, OSError.
-    """
+    """The records of a run's lines, which take a while to read; ToftrackError for damaged lines."""
     metadata = facts["metadata"]
     latent_size = (metadata.get("pose_space") or {}).get("dims", 4)
     slots = (metadata.get("config") or {}).get("hands", 1)
@@ -171,13 +156,10 @@ def finish(
     realtime: dict[str, Any] | None = None,
     apparent_m: Sequence[float | None] = (),
 ) -> dict[str, Any]:
-    """Make track.npz and summary.json of a run's frames; returns the summary.
+    """Make track.npz and summary.json of a run's frames; returns the summary. Raises OSError.
 
-    folder: with track.jsonl.  facts: of run.json.  truth: of the run's frames, by their numbers.
-    realtime: what summary.json says of a live run; the lines do not tell it.
-    apparent_m: for run_doubts; the lines do not have it either.
-
-    Raises OSError when something cannot be read or written.
+    facts: of run.json.  truth: of the run's frames, by their numbers.  realtime: what summary.json
+    says of a live run, and apparent_m, for run_doubts: the lines do not tell either.
     """
     metadata = facts["metadata"]
     rows, changed = _every_frame(records)
@@ -207,9 +189,8 @@ def count_frames(records: Records) -> int:
 
 
 def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Which record each row of track.npz is, and the columns that are not copied.
-
-    These are index, timestamp_s, compute_s and dropped, and state_name where frames were.
+    """Which record each row of track.npz is, and the columns that are not copied: index,
+    timestamp_s, compute_s and dropped, and state_name where frames were.
     """
     names = ("index", "timestamp_s", "compute_s")
     index, times, seconds = (records.column(name) for name in names)
@@ -228,15 +209,12 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         "compute_s": seconds,
         DROPPED: dropped,
     }
-    if dropped.any() and "state_name" in records.names:
-        changed["state_name"] = _reported_dropped(records.column("state_name", rows), dropped)
+    if dropped.any():
+        states = records.column("state_name", rows)  # (T,) or (T, S)
+        of_frame = dropped.reshape(-1, *(1,) * (states.ndim - 1))
+        # A slot without a hand says nothing.
+        changed["state_name"] = np.where(of_frame & (states != ""), DROPPED, states)
     return rows, changed
-
-
-def _reported_dropped(state_names: np.ndarray, dropped: np.ndarray) -> np.ndarray:
-    """(T,) or (T, S) texts that say it where a frame was; a slot without a hand says nothing."""
-    of_frame = dropped.reshape(-1, *(1,) * (state_names.ndim - 1))
-    return np.where(of_frame & (state_names != ""), DROPPED, state_names)
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
@@ -249,17 +227,14 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """
     path = Path(path).expanduser()
     try:
-        arrays = read_archive(path, {*FROM_THE_START, *KINDS, DROPPED, *_TEXTS})
-        known = (*FROM_THE_START, *(name for name in KINDS if name in arrays))
-        names = (*dict.fromkeys(known), *_TEXTS)
+        names = (*KINDS, DROPPED, *_TEXTS)
+        arrays = read_archive(path, set(names))
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
-        _check_arrays({name: arrays[name] for name in known}, content["metadata"])
-        dropped = arrays[DROPPED]
-        if dropped.dtype != bool or dropped.shape != (len(content["lost"]),):
-            raise ValueError(f"{DROPPED!r} does not fit")
-        content[DROPPED] = dropped
+        if not isinstance(content["metadata"], dict):
+            raise ValueError("the metadata are no object")
+        _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
     except OSError as error:
         raise ToftrackError(
             f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
@@ -276,20 +251,19 @@ def read_results(path: str | Path) -> dict[str, Any]:
     return content
 
 
-def _check_arrays(arrays: dict[str, np.ndarray], metadata: object) -> None:
+def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     """ValueError where arrays are not of as many frames and slots, or not of the types, that a
-    track.npz has, or where the metadata are no JSON object."""
-    if not isinstance(metadata, dict):
-        raise ValueError("the metadata are no object")
+    track.npz has.
+    """
     slots = arrays["lost"].shape
     if len(slots) not in (1, 2):
         raise ValueError(f"'lost' has the shape {slots}")
     for name, array in arrays.items():
         of_hand = slots if name in HAND_FIELDS else slots[:1]
-        end = SHAPES.get(name, array.shape[len(of_hand) :])
+        end = () if name == DROPPED else SHAPES.get(name, array.shape[len(of_hand) :])
         if array.shape != (*of_hand, *end):
             raise ValueError(f"{name!r} has the shape {array.shape}")
-        known = np.dtype(KINDS.get(name, np.float32)).kind
+        known = np.dtype(KINDS.get(name, np.bool_)).kind
         if array.dtype.kind not in {"f": "fiu", "i": "iu"}.get(known, known):
             raise ValueError(f"{name!r} is {array.dtype}")
 
@@ -321,8 +295,7 @@ def _is_whole(facts: dict[str, Any]) -> bool:
     metadata, names = facts.get("metadata"), facts.get("joint_names")
     if not isinstance(metadata, dict) or not isinstance(names, list):
         return False
-    parts = (metadata.get(name) or {} for name in _PARTS)
-    return all(isinstance(part, dict) for part in parts)
+    return all(isinstance(metadata.get(name) or {}, dict) for name in _PARTS)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -349,22 +322,21 @@ _MOST = 0.5
 
 @dataclass
 class RealTime:
-    """Of a run with a live device.
-
-    fps: frames a second that came.  tracked: frames.  reduced: of them, with less than all effort.
-    dropped: frames that came too late.
-    busy_s: seconds that the tracked ones took together, with all that was done with them.
-    longest_gap_s: the longest time from one tracked frame to the next.
-    newest_s: time stamp of the newest one; None before the first.
-    """
+    """How a run with a live device kept up, in numbers of frames and seconds."""
 
     fps: float
+    """Frames a second that came."""
     tracked: int = 0
     reduced: int = 0
+    """Of the tracked ones, with less than all effort."""
     dropped: int = 0
+    """Frames that came too late."""
     busy_s: float = 0.0
+    """The tracked ones took together, with all that was done with them."""
     longest_gap_s: float = 0.0
+    """From one tracked frame to the next."""
     newest_s: float | None = None
+    """Time stamp of the newest one; None before the first."""
 
     def add(self, timestamp_s: float, took_s: float, reduced: int, dropped: int) -> None:
         """One more frame.  reduced, dropped: of all frames until now."""

@@ -17,7 +17,7 @@ from toftrack.frames import Truth
 from toftrack.hand.shape import HandShape
 from toftrack.help_text import fields_in_help
 from toftrack.json_text import read_json
-from toftrack.output.lines import HAND_FIELDS
+from toftrack.output.lines import HAND_FIELDS, KINDS
 from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
@@ -46,8 +46,6 @@ class Run:
     """Of `read_results`: the arrays of track.npz, `joint_names` and `metadata`."""
     frames: np.ndarray
     """(T,) int64 numbers of the input frames."""
-    state_names: tuple[str, ...]
-    """T texts, of a dropped frame that of the one before; of slots that of the first."""
     summary: dict[str, Any]
     """Of summary.json."""
     shapes: tuple[HandShape, ...]
@@ -93,7 +91,7 @@ class Run:
         given = BareFacts(device.get("intrinsics"))
         camera = given.camera(store.camera.width, store.camera.height) or store.camera
         if about.get("camera_file"):
-            camera = Camera.load(self.found(about["camera_file"]))
+            camera = Camera.load(found_again(about["camera_file"], self._ran_in))
         rows = _rows(self, store, camera, about, device, name)
         truth = store.truth
         return Footage(store, camera, rows, None if truth is None else truth.of_frames(rows))
@@ -117,9 +115,7 @@ class Run:
             name: array[:, number] if name in HAND_FIELDS else array
             for name, array in self.results.items()
         }
-        names = tuple(results["state_name"].tolist())
-        shapes = self.shapes[number : number + 1]
-        return replace(self, results=results, state_names=names, shapes=shapes)
+        return replace(self, results=results, shapes=self.shapes[number : number + 1])
 
     def estimates(self, row: int) -> tuple[Estimate, ...]:
         """What the tracker said about one frame, one a slot."""
@@ -127,13 +123,10 @@ class Run:
 
     def estimate(self, row: int) -> Estimate:
         """What the tracker said about one frame of a run with one slot, see `slot`."""
-        results = self.results
-        names = {f.name for f in fields(Estimate)} & results.keys()
-        values = {name: results[name][row] for name in names}
+        values = {name: self.results[name][row] for name in KINDS}
         for name, value in values.items():
             if np.ndim(value) == 0:
                 values[name] = value.item()
-        values |= {"index": int(self.frames[row]), "state_name": self.state_names[row]}
         return Estimate(**values)
 
     def likelihood(self) -> FMeasure:
@@ -148,7 +141,7 @@ class Run:
         """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
         settings = {k: v for k, v in self._settings("pose_space").items() if k != "_target_"}
         if settings.get("file"):
-            settings["file"] = str(self.found(settings["file"]))
+            settings["file"] = str(found_again(settings["file"], self._ran_in))
         space = make_pose_space(**settings)
         if space.dims != self.results["latent"].shape[-1]:
             raise ToftrackError(
@@ -156,10 +149,6 @@ class Run:
                 "dimensional pose space of the run; put the old file back"
             )
         return space
-
-    def found(self, path: str | Path) -> Path:
-        """A path of the run's configuration as it is now: relative to here, or to where it ran."""
-        return found_again(path, self._ran_in)
 
     @property
     def _ran_in(self) -> str | None:
@@ -222,8 +211,6 @@ def read_run(folder: str | Path) -> Run:
         run.arrays["joints_m"], run.timestamp_s, run.camera, run.summary["frames"]
         run.estimate(30)
 
-    folder: with track.npz, track.jsonl, summary.json and hand_shape.json.
-
     Raises ToftrackError when it is no run's, or something in it is missing or damaged.
     """
     folder = Path(folder).expanduser()
@@ -244,14 +231,13 @@ def read_run(folder: str | Path) -> Run:
     if not len(results["lost"]):
         raise ToftrackError(f"the run in '{folder}' has no frame; there is nothing to read")
     slots = 1 if results["lost"].ndim == 1 else results["lost"].shape[1]
-    of_first = results["state_name"] if slots == 1 else results["state_name"][:, 0]
     what = f"'{folder / 'summary.json'}' cannot be read"
     with reported_errors(what, "run track.py again", OSError, ValueError):
         summary = read_json(folder / "summary.json")
         if not isinstance(summary, dict):
             raise ValueError("it is no JSON object")
     shapes = tuple(HandShape.load(folder / shape_file(slot)) for slot in range(slots))
-    return Run(folder, results, results["index"], tuple(of_first.tolist()), summary, shapes)
+    return Run(folder, results, results["index"], summary, shapes)
 
 
 def found_again(path: str | Path, ran_in: str | None) -> Path:
@@ -267,9 +253,8 @@ def open_tracked(
 ) -> tuple[FrameStore, object] | None:
     """The recording that a run's device played, and its name; None when it was a live camera.
 
-    ran_in: the run's working folder.  recording: where it is now, when it is not where it was.
-
-    Raises ToftrackError: it is gone, or cannot be read.
+    ran_in: the run's working folder.  recording: where it is now, if it was moved.  Raises
+    ToftrackError when it is gone, or cannot be read.
     """
     about = metadata.get("device") or {}
     device = (metadata.get("config") or {}).get("device") or {}

@@ -71,19 +71,13 @@ class SmoothState:
 def smooth(
     settings: OneEuro | None, state: SmoothState | None, estimate: Estimate, shape: HandShape
 ) -> tuple[SmoothState | None, Estimate]:
-    """One frame on: the new state, and the estimate with `state`, `joints_m` and pointing smoothed.
+    """One frame on: the new state, and the estimate with `state`, `joints_m` and pointing smoothed;
+    its other fields speak of the estimate as it was.
 
-    Its other fields stay: covariance, latent, score, gesture and pinch speak of the estimate as it
-    was.
-    Time is that of the frames' time stamps, so dropped frames and uneven intervals do no harm.
-
-    An estimate of a hand that is not followed (lost, being recovered, or never found) passes as it
-    is, and the filter starts anew with the next one that is; so it does at the start of a track,
-    and when time stands still or goes back.
-
-    settings: None passes everything as it is.
-    state: of the frame before; None at the start.
-    shape: the hand of the estimate.
+    Time is that of the frames' time stamps, so dropped frames and uneven intervals do no harm. An
+    estimate of a hand that is not followed (lost, being recovered, or never found) passes as it is,
+    and the filter starts anew with the next one that is; so it does at the start of a track (state
+    None), and when time stands still or goes back. Without settings everything passes as it is.
     """
     followed = estimate.state_name == "tracking" and np.isfinite(estimate.state).all()
     starts = estimate.state_name == "initialising" and not estimate.lost

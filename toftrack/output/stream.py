@@ -1,8 +1,7 @@
-"""Estimates for other programs, one frame's after the other's as they are made.
+"""Estimates for other programs: as each frame is done, a line of JSON as in track.jsonl.
 
-Each frame is a line of JSON, the same as in track.jsonl. Sending never waits for who reads: the
-tracker keeps its pace, and what a reader is too slow for is dropped, counted, and reported at the
-end.
+Sending never waits for who reads: the tracker keeps its pace, and what a reader is too slow for is
+dropped, counted, and reported at the end.
 """
 
 from __future__ import annotations
@@ -35,21 +34,25 @@ class ReaderGoneError(Exception):
 
 
 class Stream:
-    """Where estimates are sent, within a `with`."""
+    """Where estimates are sent, within a `with`; stream=none is this one, which sends nothing."""
+
+    sent = dropped = 0
+    """Estimates, over all who read."""
 
     def send(self, estimates: Sequence[Estimate]) -> None:
         """Send a frame's, one a slot, without ever waiting for who reads it; ReaderGoneError when
         nobody does.
         """
 
+    def report(self, where: str, reason: str) -> None:
+        """Log how many estimates were sent at the end of a stream, and why some were not."""
+        why = f" ({reason})" if self.dropped else ""
+        _log.info("stream: %d estimates sent %s, %d dropped%s", self.sent, where, self.dropped, why)
+
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exception: Any) -> None: ...
-
-
-class NoStream(Stream):
-    """Sends nothing."""
 
 
 class StdoutStream(Stream):
@@ -75,11 +78,15 @@ class StdoutStream(Stream):
             )
         self._lines: deque[bytes] = deque(maxlen=waiting)
         self._rest = b""
-        self._sent = self._dropped = 0
-        self._descriptor = -1
 
     def __enter__(self) -> Self:
-        self._descriptor = _claim_stdout()
+        with reported_errors(
+            "standard output cannot be used", "with stream=stdout, give it a pipe or a file"
+        ):
+            if sys.stdout is not None:
+                sys.stdout.flush()
+            self._descriptor = os.dup(_STDOUT)
+        os.dup2(_STDERR, _STDOUT)
         return self
 
     def send(self, estimates: Sequence[Estimate]) -> None:
@@ -87,7 +94,7 @@ class StdoutStream(Stream):
 
         Raises ReaderGoneError when the reader has closed the pipe or the disk is full.
         """
-        self._dropped += len(self._lines) == self._lines.maxlen
+        self.dropped += len(self._lines) == self._lines.maxlen
         self._lines.append((json_line(estimates, self._fields) + "\n").encode())
         try:
             self._write(until=0.0)
@@ -104,8 +111,8 @@ class StdoutStream(Stream):
         sys.stdout.flush()
         os.dup2(self._descriptor, _STDOUT)
         os.close(self._descriptor)
-        dropped = self._dropped + len(self._lines) + bool(self._rest)
-        report_dropped(self._sent, "to standard output", dropped, "the reader was too slow")
+        self.dropped += len(self._lines) + bool(self._rest)
+        self.report("to standard output", "the reader was too slow")
 
     def _write(self, until: float) -> None:
         """Write what waits; give up when there is no room for more, at that time at the latest."""
@@ -120,7 +127,7 @@ class StdoutStream(Stream):
             # programs that share it.
             count = os.write(self._descriptor, self._rest[: select.PIPE_BUF])
             self._rest = self._rest[count:]
-            self._sent += not self._rest
+            self.sent += not self._rest
 
 
 class UdpStream(Stream):
@@ -140,8 +147,6 @@ class UdpStream(Stream):
         family, kind, protocol, _, address = found[0]
         self._address: Any = address
         self._kind = family, kind, protocol
-        self._socket: socket.socket | None = None
-        self._sent = self._dropped = 0
         self._reason = ""
 
     def __enter__(self) -> Self:
@@ -151,25 +156,21 @@ class UdpStream(Stream):
 
     def send(self, estimates: Sequence[Estimate]) -> None:
         """Send a datagram; one that the system does not take at once is dropped."""
-        assert self._socket is not None, "send within `with`"
         try:
             self._socket.sendto(self.datagram(estimates), self._address)
         except OSError as error:  # its buffer is full, or there is no network just now
-            self._dropped += 1
+            self.dropped += 1
             self._reason = error.strerror or str(error)
         else:
-            self._sent += 1
+            self.sent += 1
 
     def datagram(self, estimates: Sequence[Estimate]) -> bytes:
         """What is sent."""
         return (json_line(estimates, self._fields) + "\n").encode()
 
     def __exit__(self, *exception: Any) -> None:
-        assert self._socket is not None
         self._socket.close()
-        self._socket = None
-        host, port = self._address[:2]
-        report_dropped(self._sent, f"to {host} port {port}", self._dropped, self._reason)
+        self.report("to {} port {}".format(*self._address), self._reason)
 
 
 def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
@@ -184,20 +185,3 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
             f"stream.fields {what}; give null for all, or some of {', '.join(LINE_FIELDS)}"
         )
     return names
-
-
-def _claim_stdout() -> int:
-    """A descriptor of standard output; what is printed from now on goes to standard error."""
-    what = "standard output cannot be used"
-    with reported_errors(what, "with stream=stdout, give it a pipe or a file"):
-        if sys.stdout is not None:
-            sys.stdout.flush()
-        own = os.dup(_STDOUT)
-    os.dup2(_STDERR, _STDOUT)
-    return own
-
-
-def report_dropped(sent: int, where: str, dropped: int, reason: str) -> None:
-    """Log how many estimates were sent at the end of a stream."""
-    why = f" ({reason})" if dropped else ""
-    _log.info("stream: %d estimates sent %s, %d dropped%s", sent, where, dropped, why)

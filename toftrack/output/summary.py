@@ -26,8 +26,6 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt
 
-_MEASURED = tuple(field.name for field in fields(Estimates))
-
 
 def shape_file(slot: int) -> str:
     """The name of the file with the fitted hand of a slot."""
@@ -37,9 +35,8 @@ def shape_file(slot: int) -> str:
 def summarise(
     records: Records, rows: int, dropped: int, folder: Path, metadata: dict[str, Any]
 ) -> dict[str, Any]:
-    """The summary without metrics.
-
-    rows: frames of the input.  dropped: how many of them were.  folder: where the hands' files are.
+    """The summary without metrics, of so many frames of the input; the hands' files are in the
+    folder.
     """
     done = records.count
     seconds = records.column("compute_s").astype(np.float64)
@@ -99,11 +96,8 @@ def run_doubts(
     metadata: dict[str, Any],
     apparent_m: Sequence[float | None] = (),
 ) -> list[str]:
-    """What speaks against a run's input, a sentence each: what its device found, the frames' times
-    where the device dropped them, and how long the fitted hands are.
-
-    apparent_m: of the slots, how long the hand seemed where it was mostly lost; () where the run
-    did not say.
+    """What speaks against a run's input, a sentence each: what its device found, or the frames'
+    times, and how long the fitted hands are, or seemed where they were mostly lost (apparent_m).
     """
     configured = (metadata.get("device") or {}).get("doubts")
     found = [times_doubt(records.column("timestamp_s"))] if configured is None else list(configured)
@@ -112,19 +106,15 @@ def run_doubts(
         for slot, apparent in zip_longest(range(records.slots), apparent_m):
             shape = _shape(folder, slot)
             fitted = "" if shape is None else length_doubt(shape, np.array(k))
-            found.append(
-                fitted or ("" if apparent is None else apparent_doubt(apparent, np.array(k)))
-            )
+            found += [fitted or ("" if apparent is None else apparent_doubt(apparent, np.array(k)))]
     return list(filter(None, found))
 
 
 def run_metrics(
     records: Records, rows: np.ndarray, index: np.ndarray, truth: Truth, counted: np.ndarray
 ) -> dict[str, Any] | None:
-    """The metrics over those frames that count and whose numbers the truth has; None where it has
-    none of them.
-
-    rows: records.  index: numbers of their frames.  counted: (T,) bool of them.
+    """The metrics over those frames that count (T,) and whose numbers (index) the truth has; None
+    where it has none of them.
     """
     true = index - truth.first
     inside = (true >= 0) & (true < len(truth))
@@ -133,7 +123,7 @@ def run_metrics(
         return None
     position = np.flatnonzero(counted[inside])
     found = truth.of_frames(index[known])
-    done = {name: records.column(name, rows[known]) for name in _MEASURED if name in records.names}
+    done = {field.name: records.column(field.name, rows[known]) for field in fields(Estimates)}
     estimates = Estimates(**found_side(done))
     both = measured(estimates, found)
     if both.slots is None:
@@ -151,29 +141,20 @@ def run_metrics(
 def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The arrays of a track without its side where that was given: it is no finding then."""
     probability = arrays.get("side_probability", np.ones(0))
-    known = probability[np.isfinite(probability)]
-    configured = bool((known == 1).all())
-    return {
-        name: array
-        for name, array in arrays.items()
-        if not (configured and name.startswith("side"))
-    }
+    if not (probability[np.isfinite(probability)] == 1).all():
+        return arrays
+    return {name: array for name, array in arrays.items() if not name.startswith("side")}
 
 
 def _metrics(
     of: Measured, estimates: Estimates, truth: Truth, position: np.ndarray
 ) -> dict[str, Any]:
-    """Of one hand.
-
-    position: (T,) of the frames among all, with those that do not count.
-    """
+    """Of one hand; position: (T,) of the frames among all, with those that do not count."""
     metrics = {"trust": asdict(of.trust)} | evaluate(estimates.joints_m, estimates.lost, truth)
     for event in metrics["reacquisition"]:
         event["frame"] = int(position[event["frame"]])
-    regions = {name: of.figures.get(name) for name in REGION_FIGURES}
-    if estimates.joint_sigma_m is not None:
-        metrics["coverage"] = regions
-    further = {name: value for name, value in of.figures.items() if name not in regions}
+    metrics["coverage"] = {name: of.figures.get(name) for name in REGION_FIGURES}
+    further = {name: value for name, value in of.figures.items() if name not in REGION_FIGURES}
     return metrics | {"further": further}
 
 
@@ -188,8 +169,7 @@ usual."""
 
 
 def length_doubt(shape: HandShape, k: np.ndarray) -> str:
-    """What speaks against the camera matrix k (3, 3), in pixels, where a hand was fitted; "" for
-    nothing."""
+    """What speaks against the camera matrix k (3, 3), px, where a hand was fitted; "": nothing."""
     fitted = shape.fitted
     if fitted is None:
         return ""
@@ -278,12 +258,10 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
         text_of(trust[name] if seen else None) for name in ("usable_pct", "false_alarm_pct")
     )
     right = "never" if first is None else f"in frame {first}"
+    in_a_row = f", up to {longest} frames in a row" if longest else ""
     rows = [
         ("usable", f"{usable} % of the {seen} visible frames"),
-        (
-            "silently wrong",
-            f"{silent} %" + (f", up to {longest} frames in a row" if longest else ""),
-        ),
+        ("silently wrong", f"{silent} %{in_a_row}"),
         ("false alarms", f"{alarms} %"),
         ("first right", right if seen else "-"),
     ]
@@ -309,8 +287,8 @@ def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     if precision is not None or recall is not None:
         text = f"precision {text_of(precision, 2)}, recall {text_of(recall, 2)}"
         rows.append(("lost frames", text))
-    coverage, further = metrics.get("coverage", {}), metrics["further"]
-    if (inside := coverage.get("in_region_90_pct")) is not None:
+    coverage, further = metrics["coverage"], metrics["further"]
+    if (inside := coverage["in_region_90_pct"]) is not None:
         hidden = coverage["hidden_in_region_90_pct"]
         of_hidden = "" if hidden is None else f", {text_of(hidden)} % of the hidden ones"
         rows.append(("in their 90 % region", f"{text_of(inside)} % of the joints{of_hidden}"))

@@ -21,8 +21,7 @@ from scipy.spatial.transform import Rotation
 from toftrack.errors import reported_errors
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES
-from toftrack.output.exports.glb import glb_of
-from toftrack.output.exports.motion import HandMotion, motions_of
+from toftrack.output.exports import HandMotion, glb_of, motions_of
 from toftrack.output.lines import DROPPED
 from toftrack.output.run_folder import Run, read_run
 from toftrack.programs.command_line import plain_parser

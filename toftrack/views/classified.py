@@ -52,7 +52,6 @@ def classify(
     """Tell the pixels that the likelihood counts; their numbers are the scorer's counts.
 
     state: (27,) of the hypothesis; where it is NaN there is none, and every image is empty.
-    shape: of the hand.
     """
     observation = observation.to(torch.device("cpu"))
     evidence = likelihood.evidence(observation)

@@ -15,13 +15,7 @@ import numpy as np
 
 from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import (
-    Estimate,
-    confidence_words,
-    gesture_words,
-    is_vacant,
-    state_words,
-)
+from toftrack.estimate import Estimate, confidence_words, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame, View
@@ -63,21 +57,11 @@ def draw_panel(
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above the left, frame number, gesture and confidence; above the right, state and score. A red
-    caption and frame mark an estimate that is lost, of several hands that all are. The skeleton is
-    missing where the estimate is NaN; see draw_hands for the rest.
-
-    Args:
-        depth_m: (H, W) metres, 0 = no reading; shown without amplitude, nearer is brighter.
-        amplitude: (H, W), shown in grey; or None.
-        camera: projects the joints.
-        estimates: of this frame, one a slot.
-        models: of each, (H, W) metres of the estimate's surface, anything not positive and finite
-            is background; None leaves it out. Nearer is darker, on white; several hands are tinted
-            with their slots' colours.
-        scale: panel pixels per image pixel.
-
-    Returns:
-        (h, w, 3) uint8 BGR with h and w even; the two sides are the halves of w.
+    caption and frame mark an estimate that is lost, of several hands that all are. The image is the
+    amplitude (H, W) in grey, without it depth_m (H, W), nearer brighter; see draw_hands for what is
+    drawn of the slots' estimates. models: of each, (H, W) metres of its surface, or None; nearer is
+    darker, on white, several hands are tinted with their slots' colours. scale: panel pixels per
+    image pixel. Returns (h, w, 3) uint8 BGR, h and w even; the two sides are the halves of w.
     """
     height, width = depth_m.shape
     # Even, so that a video of it can be encoded.
@@ -125,7 +109,7 @@ def _with_hands(
 
 
 def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
-    """The panel of a tracked frame, (h, w, 3); see draw_panel."""
+    """The panel of a tracked frame; see draw_panel."""
     amplitude = tracked.camera.undistort_amplitude(tracked.frame.amplitude)
     shapes = [hand.shape for hand in tracked.hands]
     return draw_estimates(tracked.depth_m, amplitude, tracked.camera, tracked.estimates, shapes)
@@ -148,8 +132,6 @@ def draw_estimates(
 
 class VideoView(View):
     """Keeps panels as a video, overlay.mp4, and as a filmstrip of ten of them, overlay.png.
-
-    frames: how many panels are to come at most, or None where nobody knows.
 
     Raises ToftrackError where nothing encodes; by `add` and `close`, when a file cannot be written.
     """
@@ -177,8 +159,12 @@ class VideoView(View):
         if panel.shape[1::-1] != self._size:
             panel = cv2.resize(panel, self._size, interpolation=cv2.INTER_AREA)
         self._video.add(panel)
+        if self._count % self._stride == 0 and len(self._tiles) == _STRIP_KEPT:
+            # Too many: every other one goes, and of those to come, too.
+            self._tiles = self._tiles[::2]
+            self._stride *= 2
         if self._count % self._stride == 0:
-            self._keep(panel)
+            self._tiles.append(film_tile(panel))
         self._count += 1
 
     def close(self) -> None:
@@ -189,26 +175,14 @@ class VideoView(View):
         try:
             video.close()
         finally:
-            self._write_strip()
+            with writing(self.strip_path):
+                write_picture(self.strip_path, filmstrip(self._tiles))
 
     def __exit__(self, kind: type[BaseException] | None, *exception: object) -> None:
         # What went wrong before is what matters, such as a disk that is full.
         ended = kind is None or issubclass(kind, KeyboardInterrupt)
         with nullcontext() if ended else suppress(ToftrackError):
             self.close()
-
-    def _write_strip(self) -> None:
-        with writing(self.strip_path):
-            write_picture(self.strip_path, filmstrip(self._tiles))
-
-    def _keep(self, panel: np.ndarray) -> None:
-        """Keep a tile; when they become too many, every other one goes and the stride doubles."""
-        if len(self._tiles) == _STRIP_KEPT:
-            self._tiles = self._tiles[::2]
-            self._stride *= 2
-            if self._count % self._stride:
-                return
-        self._tiles.append(film_tile(panel))
 
 
 def _amplitude_grey(amplitude: np.ndarray) -> np.ndarray:
@@ -262,9 +236,9 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
     number = f"frame {estimates[0].index}"
     if len(estimates) == 1:
         one = estimates[0]
+        score = f"{one.score:.2f}" if math.isfinite(one.score) else "-"
         _write_line(halves[0], (number, gesture_words(one)), 8)
-        facts = [_state(one), confidence_words(one.confidence), f"score {_score(one)}"]
-        _write_line(halves[1], facts, 8)
+        _write_line(halves[1], (_state(one), confidence_words(one.confidence), f"score {score}"), 8)
         return np.hstack(halves)
     for slot, (one, half) in enumerate(zip(estimates, halves, strict=False)):
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
@@ -274,10 +248,6 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
         facts = ["no hand"] if is_vacant(one) else facts
         _write_line(half, facts if slot else [number, *facts], 38)
     return np.vstack([np.hstack(halves[row : row + 2]) for row in range(0, count, 2)])
-
-
-def _score(estimate: Estimate) -> str:
-    return f"{estimate.score:.2f}" if math.isfinite(estimate.score) else "-"
 
 
 def _state(estimate: Estimate) -> str:
@@ -345,19 +315,14 @@ def draw(
     Joints that are more likely wrong than right are hollow; an estimate that is lost has a red
     frame around the picture, and no skeleton where it has no joints.
 
-    Args:
-        image: what was tracked, on the undistorted grid of `Camera.rectify`: (H, W) floating-point
-            metres, 0 = no reading, (H, W) whole numbers of an amplitude, or (H, W, 3) uint8 RGB.
-        estimate: of `Tracker.step`, or those of `HandsTracker.step`.
-        camera: of the image, or its (3, 3) pinhole matrix K in pixels.
-        scale: pixels of the picture per pixel of the image; None makes it about 528 wide, and
-            leaves larger images as they are.
+    image: on the undistorted grid of `Camera.rectify`, (H, W) floating-point metres, 0 = no
+    reading, (H, W) whole numbers of an amplitude, or (H, W, 3) uint8 RGB.  estimate: of
+    `Tracker.step`, or those of `HandsTracker.step`.  camera: of the image, or its (3, 3) pinhole
+    matrix K in pixels.  scale: pixels of the picture per pixel of the image; None makes it about
+    528 wide, and leaves larger images as they are.
 
-    Returns:
-        (h, w, 3) uint8 RGB, as Matplotlib and Pillow take it; OpenCV wants picture[..., ::-1].
-
-    Raises:
-        ToftrackError: the image is none of these, or not of the camera's size.
+    Returns (h, w, 3) uint8 RGB, as Matplotlib and Pillow take it; OpenCV wants picture[..., ::-1].
+    Raises ToftrackError: the image is none of these, or not of the camera's size.
     """
     grey = _checked(image)
     height, width = grey.shape[:2]

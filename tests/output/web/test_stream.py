@@ -7,15 +7,15 @@ import json
 import logging
 import re
 import socket
-import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from helpers.browsing import PATIENCE_S, eventually, ours
 from helpers.hands import hand_estimate, lost_hand
 from helpers.settings import part
 from websockets.sync import client
@@ -24,8 +24,6 @@ from toftrack.errors import ToftrackError
 from toftrack.output.lines import json_line
 from toftrack.output.web.server import MOST_HALF_OPEN
 from toftrack.output.web.stream import WebSocketStream
-
-PATIENCE_S = 20
 
 
 def websocket_stream(**changes: Any) -> WebSocketStream:
@@ -47,11 +45,9 @@ def listening(stream: WebSocketStream, **headers: str) -> Any:
     return opened
 
 
-def eventually(reported: Callable[[], object]) -> None:
-    deadline = time.monotonic() + PATIENCE_S
-    while not reported():
-        assert time.monotonic() < deadline
-        time.sleep(0.005)
+def index_of(one: Any) -> int:
+    """Of the next line that a client gets."""
+    return json.loads(one.recv(PATIENCE_S))["index"]
 
 
 def answer(stream: WebSocketStream, path: str, **headers: str) -> tuple[int, dict, str]:
@@ -80,7 +76,7 @@ def test_a_client_that_leaves_disturbs_nobody(stream: WebSocketStream) -> None:
             leaves.socket.shutdown(socket.SHUT_RDWR)
             eventually(lambda: len(stream._server.clients) == 1)
         stream.send((hand_estimate(1),))
-        assert json.loads(stays.recv(PATIENCE_S))["index"] == 1
+        assert index_of(stays) == 1
 
 
 def test_a_client_that_sends_again_and_again_is_answered_and_stays(
@@ -92,7 +88,7 @@ def test_a_client_that_sends_again_and_again_is_answered_and_stays(
             one.send(f"message {number}" if number % 2 else b"bytes")
         assert one.ping().wait(PATIENCE_S)
         stream.send((hand_estimate(1),))
-        assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+        assert index_of(one) == 1
 
 
 def half_open(stream: WebSocketStream, count: int, words: bytes = b"") -> list[socket.socket]:
@@ -129,7 +125,7 @@ def test_connections_that_ask_nothing_are_few_and_keep_nobody_out(
         with listening(stream) as after:
             stream.send((hand_estimate(1),))
             for one in (before, after):
-                assert json.loads(one.recv(PATIENCE_S))["index"] == 1
+                assert index_of(one) == 1
             assert answer(stream, "/")[0] == 200
         assert len(stream._server._open) <= MOST_HALF_OPEN + 2
         eventually(lambda: all(map(ended, opened)))  # they have seconds to ask
@@ -141,7 +137,7 @@ def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
         with websocket_stream() as stream:
             opened = [stack.enter_context(one) for one in half_open(stream, 5)]
             eventually(lambda: len(stream._server._open) == 5)
-        assert not any(t.name == "web-server" for t in threading.enumerate())
+        assert ours() == []
         eventually(lambda: all(map(ended, opened)))
 
 
@@ -190,7 +186,7 @@ def test_its_own_pages_and_those_that_are_named_may_listen() -> None:
         for origin in (own, "http://localhost:3000"):
             with listening(stream, Origin=origin) as one:
                 stream.send((hand_estimate(4),))
-                assert json.loads(one.recv(PATIENCE_S))["index"] == 4
+                assert index_of(one) == 4
 
 
 def test_the_pages_come_with_all_that_they_need(stream: WebSocketStream) -> None:
@@ -218,7 +214,7 @@ def test_the_last_lines_arrive_and_then_everything_ends() -> None:
                 stream.send((hand_estimate(index),))
         found = [json.loads(message)["index"] for message in one]
     assert found == list(range(10))
-    assert not any(t.name == "web-server" for t in threading.enumerate())
+    assert ours() == []
 
 
 def test_a_port_that_is_taken_is_reported(stream: WebSocketStream) -> None:

@@ -12,13 +12,16 @@ import asyncio
 import errno
 import functools
 import ipaddress
+import json
 import logging
 import math
+import secrets
 import threading
+from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from importlib import resources
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, serve
@@ -27,6 +30,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from toftrack.errors import ToftrackError
+from toftrack.json_text import parse_json
 
 _log = logging.getLogger(__name__)
 
@@ -58,38 +62,55 @@ ANY_PORT = " (0 = any free one)"
 """What is said of a port that cannot be meant."""
 
 
-class Client(Protocol):
-    """What one websocket is sent and says. Called from the server's thread alone."""
+class Client:
+    """What one websocket is sent and says; of the server's thread alone.
 
-    news: asyncio.Event
-    """To be set when `take` has something."""
+    most_waiting: messages that wait at a time. At the end they have a second to leave.
+    """
+
+    def __init__(self, most_waiting: int) -> None:
+        self._most_waiting = most_waiting
+        self._messages: deque[str | bytes] = deque()
+        self.news = asyncio.Event()
+        """That `take` has something."""
+
+    def tell(self, facts: dict[str, Any], *more: bytes) -> None:
+        """Send facts and what follows, unless too much waits already."""
+        if len(self._messages) < self._most_waiting:
+            self._messages += (json.dumps(facts, allow_nan=False), *more)
+            self.news.set()
 
     def take(self) -> str | bytes | None:
         """The next message to send; None where there is none."""
+        return self._messages.popleft() if self._messages else None
 
     def receive(self, message: str | bytes) -> None:
-        """Look at what was sent by the other side."""
+        """Look at what was sent by the other side; here nobody does."""
 
     def __len__(self) -> int:
-        """How many messages wait; at the end of the server they have a second to leave."""
+        return len(self._messages)
+
+
+def request_of(message: str | bytes, token: str) -> tuple[dict[str, Any], bool]:
+    """The object that a page sent, {} for anything else, and whether it has the token."""
+    try:
+        content = parse_json(message)
+    except ValueError:
+        content = None
+    content = content if isinstance(content, dict) else {}
+    given = str(content.get("token")).encode("utf-8", "replace")
+    return content, secrets.compare_digest(given, token.encode())
 
 
 class WebServer:
     """Serves from a thread of its own, from construction until `close`.
 
-    Args:
-        group: whose settings `host` and `port` are, for errors; "" where they are the options
-            --host and --port.
-        host: name or address of the network interface.
-        port: 0 = any free one.
-        package: where the files of `pages` are.
-        pages: the names of files by the paths that they are served at.
-        path: where websockets are opened.
-        new_client: makes what talks to a websocket.
-        origins: of pages of other servers that may open one, as "http://localhost:3000".
+    group: whose settings `host` and `port` (0 = any free one) are, for errors; "" where they are
+    the options --host and --port.  pages: names of files in `package`, by the paths that they are
+    served at.  path: where websockets are opened, each with a client by `new_client`.  origins: of
+    pages of other servers that may open one, as "http://localhost:3000".
 
-    Raises:
-        ToftrackError: the port is taken or not allowed, or there is no such host here.
+    Raises ToftrackError: the port is taken or not allowed, or there is no such host here.
     """
 
     def __init__(

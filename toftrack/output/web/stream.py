@@ -12,17 +12,15 @@ What clients send is read and thrown away; who may listen, server.py says.
 
 from __future__ import annotations
 
-import asyncio
 import sys
-from collections import deque
 from collections.abc import Sequence
 from typing import Any, Self
 
 from toftrack.checks import check_number
 from toftrack.estimate import Estimate
 from toftrack.output.lines import json_line
-from toftrack.output.stream import Stream, known_fields, report_dropped
-from toftrack.output.web.server import ANY_PORT, WebServer
+from toftrack.output.stream import Stream, known_fields
+from toftrack.output.web.server import ANY_PORT, Client, WebServer
 
 STREAM = "/stream"
 _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
@@ -31,11 +29,9 @@ _PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
 class WebSocketStream(Stream):
     """A message a line to every client, and the pages, from a thread of its own within the `with`.
 
-    A client that is too slow loses its oldest lines. Where there is no client nothing is made. The
-    settings: conf/stream/websocket.yaml; `live` is for the devices alone, which follow it.
-
-    Raises ToftrackError for an unknown field or an impossible number; by `with`, when the port is
-    taken or not allowed, or there is no such host here.
+    A client that is too slow loses its oldest lines; where there is none nothing is made. The
+    settings: conf/stream/websocket.yaml; `live` is for the devices alone, which follow it. Raises
+    ToftrackError for an unknown field or an impossible number; by `with`, as WebServer.
     """
 
     def __init__(
@@ -52,8 +48,6 @@ class WebSocketStream(Stream):
         check_number("stream.waiting", waiting, 1, whole=True)
         self._host, self._port, self._waiting = str(host), port, waiting
         self._origins = (origins,) if isinstance(origins, str) else tuple(origins)
-        self.sent = self.dropped = 0
-        """Lines, over all clients."""
 
     def __enter__(self) -> Self:
         self._server = WebServer(
@@ -77,39 +71,27 @@ class WebSocketStream(Stream):
             self._server.call(self._offer, json_line(estimates, self._fields))
 
     def __exit__(self, *exception: Any) -> None:
-        left = self._server.close()
-        self.dropped += left
-        report_dropped(
-            self.sent, f"to clients of {self.url}", self.dropped, "a client was too slow"
-        )
+        self.dropped += self._server.close()
+        self.report(f"to clients of {self.url}", "a client was too slow")
 
     def _offer(self, line: str) -> None:
         for client in self._server.clients:
             client.offer(line)
 
 
-class _Listener:
-    """Lines that wait for one client."""
-
+class _Listener(Client):
     def __init__(self, stream: WebSocketStream, waiting: int) -> None:
+        super().__init__(waiting)
         self._stream = stream
-        self._lines: deque[str] = deque(maxlen=waiting)
-        self.news = asyncio.Event()
 
     def offer(self, line: str) -> None:
         """Keep a line, in place of the oldest where there are too many."""
-        self._stream.dropped += len(self._lines) == self._lines.maxlen
-        self._lines.append(line)
+        if len(self) == self._most_waiting:
+            self._messages.popleft()
+            self._stream.dropped += 1
+        self._messages.append(line)
         self.news.set()
 
-    def take(self) -> str | None:
-        if not self._lines:
-            return None
-        self._stream.sent += 1
-        return self._lines.popleft()
-
-    def receive(self, message: str | bytes) -> None:
-        """Nobody looks at it."""
-
-    def __len__(self) -> int:
-        return len(self._lines)
+    def take(self) -> str | bytes | None:
+        self._stream.sent += bool(self)
+        return super().take()

@@ -20,7 +20,6 @@ watch, no more. It stands after `#`, which a browser keeps to itself.
 from __future__ import annotations
 
 import asyncio
-import json
 import math
 import secrets
 import sys
@@ -30,7 +29,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import cv2
 
@@ -38,11 +37,16 @@ from toftrack.checks import check_number
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError
 from toftrack.estimate import is_vacant, state_words
-from toftrack.json_text import parse_json
-from toftrack.output.web.server import ANY_PORT, WebServer
-from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand
+from toftrack.output.lines import hand_content, strict
+from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of
+from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand, View
 from toftrack.views.overlay import caption_px, draw_tracked
 
+_SHOWN = (
+    *("lost", "score", "confidence", "gesture", "gesture_probability", "pinch", "pinching"),
+    *("side", "side_probability"),
+)
+"""Fields of each hand that the page writes."""
 _RATE_S = 2.0
 """The frames a second are those of so long."""
 _MOST_COMMANDS = 16
@@ -52,26 +56,12 @@ _MOST_WAITING = 8
 """Messages to a page that does not read them."""
 
 
-class BrowserView:
-    """The live page, as a view: served from construction until `close`.
+class BrowserView(View):
+    """The live page, served from construction until `close`.
 
     Its address is printed on standard error. Where there is a last frame that could be missed, a
-    first visitor is waited for.
-
-    Args:
-        folder, fps: as every view gets them, and of no use here.
-        frames: how many there are to come; None = no end is known.
-        host: address of the network interface.
-        port: 0 = any free one.
-        quality: of the JPEGs, 1 to 100.
-        most_fps: pictures a second at most.
-        wait_s: seconds to wait for the first visitor; 0 = do not.
-        linger_s: seconds the page stays after the last frame, inf = until Ctrl-C.
-        live: nothing to the view; recordings' `realtime` and the sample's `repeat` follow it in the
-            configuration.
-
-    Raises:
-        ToftrackError: a bad setting, or the page cannot be served there.
+    first visitor is waited for. The settings: conf/view/browser.yaml; `live` is for the devices
+    alone, which follow it. Raises ToftrackError: a bad setting, or it cannot be served there.
     """
 
     def __init__(
@@ -148,9 +138,6 @@ class BrowserView:
         self._end("stopped")
         self._server.close()
 
-    def __enter__(self) -> Self:
-        return self
-
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
         """Close; after an ordinary end the page stays for a while, until Ctrl-C at the longest."""
         try:
@@ -221,53 +208,34 @@ class BrowserView:
             await self._work.wait()
 
 
-class _Visitor:
-    """The page of one visitor."""
-
+class _Visitor(Client):
     def __init__(self, view: BrowserView) -> None:
+        super().__init__(_MOST_WAITING)
         self._view = view
         self.asked, self._version = 0, 0
-        """Pictures that the page waits for."""
-        self._messages: deque[str | bytes] = deque()
-        self.news = asyncio.Event()
+        """Pictures that the page waits for; the last one that it got."""
         self.tell(view.facts())
-
-    def tell(self, facts: dict[str, Any]) -> None:
-        """Send facts, unless too much waits already."""
-        if len(self._messages) < _MOST_WAITING:
-            self._messages.append(json.dumps(facts, allow_nan=False))
-            self.news.set()
 
     def take(self) -> str | bytes | None:
         view = self._view
         if not self._messages and self.asked and view.version > self._version:
             self.asked, self._version = self.asked - 1, view.version
-            self.tell(view.facts(picture=True))
-            self._messages.append(view.jpeg)
-        return self._messages.popleft() if self._messages else None
+            self.tell(view.facts(picture=True), view.jpeg)
+        return super().take()
 
     def receive(self, message: str | bytes) -> None:
-        try:
-            content = parse_json(message)
-        except ValueError:
-            content = None
-        content = content if isinstance(content, dict) else {}
-        command, token = content.get("command"), str(content.get("token"))
+        content, allowed = request_of(message, self._view.token)
+        command = content.get("command")
         if command == "picture":
             self.asked = min(self.asked + 1, _MOST_ASKED)
             self.news.set()
             self._view.wanted()
         elif command not in COMMANDS:
             self.tell({"refused": f"a command is one of {', '.join(COMMANDS)}"})
-        elif not secrets.compare_digest(
-            token.encode("utf-8", "replace"), self._view.token.encode()
-        ):
+        elif not allowed:
             self.tell({"refused": "commands need the whole address that the tracker printed"})
         else:
             self._view.asked.append(command)
-
-    def __len__(self) -> int:
-        return len(self._messages)
 
 
 def _stay(seconds: float) -> None:
@@ -292,7 +260,7 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
     first = tracked.hands[0]
     of_frame = {
         "index": int(first.estimate.index),
-        "ms": _number(1e3 * first.estimate.compute_s),
+        "ms": strict(1e3 * first.estimate.compute_s),
         "advice": list(tracked.advice),
     }
     if len(tracked.hands) == 1:
@@ -306,24 +274,8 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
 
 
 def _hand_facts(hand: TrackedHand) -> dict[str, Any]:
-    estimate = hand.estimate
-    return {
-        "there": not is_vacant(estimate),
-        "state": state_words(estimate),
-        "lost": bool(estimate.lost),
-        "score": _number(estimate.score),
-        "confidence": _number(estimate.confidence),
-        "gesture": estimate.gesture,
-        "gesture_probability": _number(estimate.gesture_probability),
-        "pinch": _number(estimate.pinch),
-        "pinching": bool(estimate.pinching),
-        "side": estimate.side,
-        "side_probability": _number(estimate.side_probability),
-    }
-
-
-def _number(value: float) -> float | None:
-    return round(float(value), 6) if math.isfinite(value) else None
+    state = {"there": not is_vacant(hand.estimate), "state": state_words(hand.estimate)}
+    return state | hand_content(hand.estimate, _SHOWN)
 
 
 def _rate(times_s: Sequence[float]) -> float | None:

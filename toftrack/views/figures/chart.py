@@ -100,13 +100,6 @@ def picture_above(axes: Axes, point: np.ndarray, grey: np.ndarray) -> None:
     axes.add_artist(AnnotationBbox(OffsetImage(shown, dpi_cor=False), tuple(point), **above))
 
 
-def round_numbers(first: int, last: int, most: int = 10) -> np.ndarray:
-    """Whole round numbers from about `first` to about `last`."""
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(most, integer=True).tick_values(first, last)
-
-
 def round_log_ticks(axes: Axes, which: str) -> None:
     """Make axis `which`, x or y, logarithmic, with 1, 2 and 5 times powers of ten at its ticks."""
     from matplotlib.ticker import LogLocator, NullFormatter

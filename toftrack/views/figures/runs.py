@@ -55,13 +55,8 @@ def measurement_figure(run: Run, footage: Footage, row: int, of: str) -> np.ndar
     hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
     counted = pixels.neighbourhood | (pixels.range_m > 0)
     shown = counted if counted.any() else hand
-    rows, columns = np.flatnonzero(shown.any(1)), np.flatnonzero(shown.any(0))
-    here = np.s_[:, :]
-    if len(rows):
-        here = np.s_[
-            max(0, rows[0] - _MARGIN_PX) : rows[-1] + 1 + _MARGIN_PX,
-            max(0, columns[0] - _MARGIN_PX) : columns[-1] + 1 + _MARGIN_PX,
-        ]
+    ends = [np.flatnonzero(shown.any(axis))[[0, -1]] for axis in (1, 0) if shown.any()]
+    here = tuple(slice(max(0, a - _MARGIN_PX), b + 1 + _MARGIN_PX) for a, b in ends)
     # In one go, so that the same grey is the same distance in both.
     greys = np.hsplit(range_grey(np.hstack([np.where(hand, depth, 0), pixels.range_m])), 2)
     near = np.full_like(greys[0], 255)
@@ -152,6 +147,8 @@ def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: st
 
     truth, metrics: of the hand that is followed.
     """
+    from matplotlib.ticker import MaxNLocator
+
     results, time_s = run.results, _time(run)
     score = np.where(np.isfinite(results["score"]), results["score"], np.nan)
     error_mm = None
@@ -172,14 +169,12 @@ def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: st
         axes.legend(loc="upper left", ncols=2)
     _draw_score(below, run, score)
     if truth is not None:
-        absent, name = (
-            ~(truth.visible & truth.in_space),
-            "no hand of the known poses, says the truth",
-        )
+        absent = ~(truth.visible & truth.in_space)
+        name = "no hand of the known poses, says the truth"
         chart.shade(below, time_s, absent, chart.GREY, name, top=0.96)
-    frames = run.frames
-    at = np.flatnonzero(np.isin(frames, chart.round_numbers(frames[0], frames[-1])))
-    _number_frames(below, time_s[at], frames[at])
+    round_numbers = MaxNLocator(10, integer=True).tick_values(run.frames[0], run.frames[-1])
+    at = np.flatnonzero(np.isin(run.frames, round_numbers))
+    _number_frames(below, time_s[at], run.frames[at])
     figure.legend(
         *below.get_legend_handles_labels(), loc="outside lower left", ncols=4, frameon=False
     )

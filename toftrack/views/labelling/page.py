@@ -15,17 +15,13 @@ What is refused, or cannot be written, is answered with `{"failed": why}`.
 
 from __future__ import annotations
 
-import asyncio
-import json
 import secrets
-from collections import deque
 from collections.abc import Sequence
 from typing import Any
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.labelling import LABELLED, LabelFile, LabelFrame
-from toftrack.json_text import parse_json
-from toftrack.output.web.server import WebServer
+from toftrack.output.web.server import Client, WebServer, request_of
 
 _MOST_WAITING = 16
 """Messages to a page that does not read them."""
@@ -34,14 +30,8 @@ _MOST_WAITING = 16
 class LabelPage:
     """The page, served on this machine from construction until `close`.
 
-    Args:
-        labels: the file; from now on only the server's thread changes it.
-        frames: those that are shown, in this order.
-        gestures: the names to choose from.
-        port: 0 = any free one.
-
-    Raises:
-        ToftrackError: the port is taken or not allowed.
+    From now on only the server's thread changes `labels`. The frames are shown in their order; port
+    0 is any free one. Raises ToftrackError: the port is taken or not allowed.
     """
 
     def __init__(
@@ -50,7 +40,6 @@ class LabelPage:
         self.labels, self.gestures = labels, gestures
         self.frames = {frame.number: frame for frame in frames}
         self.token = secrets.token_urlsafe(12)
-        """What every message must carry."""
         self._server = WebServer(
             *("", "127.0.0.1", port, "toftrack.views.labelling", {"/": "page.html"}, "/labels"),
             lambda: _Visitor(self),
@@ -62,7 +51,7 @@ class LabelPage:
         self._server.close()
 
     def about(self) -> dict[str, Any]:
-        """What the page begins with, JSON-able."""
+        """What the page begins with."""
         content = self.labels.content
         return {
             "recording": content.get("recording", ""),
@@ -70,11 +59,13 @@ class LabelPage:
             "side": content["side"],
             "joints": LABELLED,
             "gestures": self.gestures,
-            "frames": [
-                {"number": number, **_shown(self.labels.frames[str(number)])}
-                for number in self.frames
-            ],
+            "frames": [self._labels_of(number) for number in self.frames],
         }
+
+    def _labels_of(self, number: int) -> dict[str, Any]:
+        frame = self.labels.frames[str(number)]
+        points = {name: point for name, point in frame["points"].items() if name in LABELLED}
+        return {"number": number, "points": points, "gesture": frame.get("gesture")}
 
     def change(self, content: dict[str, Any]) -> None:
         """Do what a message asks for; ValueError for what cannot be meant, ToftrackError where it
@@ -83,20 +74,15 @@ class LabelPage:
         if "side" in content:
             self.labels.set_side(content["side"])
             return
-        kind = "point" if "point" in content else "gesture"
-        given = content.get(kind)
-        if not isinstance(given, list) or len(given) != (3 if kind == "point" else 2):
-            raise ValueError("the message is none that this server knows")
-        if kind == "point":
-            self.labels.set_point(*given)
-        else:
-            self.labels.set_gesture(*given)
-
-
-def _shown(frame: dict[str, Any]) -> dict[str, Any]:
-    """What the page needs of a frame's labels."""
-    points = {name: point for name, point in frame["points"].items() if name in LABELLED}
-    return {"points": points, "gesture": frame.get("gesture")}
+        for name, count, change in (
+            ("point", 3, self.labels.set_point),
+            ("gesture", 2, self.labels.set_gesture),
+        ):
+            given = content.get(name)
+            if isinstance(given, list) and len(given) == count:
+                change(*given)
+                return
+        raise ValueError("the message is none that this server knows")
 
 
 def _picture(frame: LabelFrame) -> dict[str, Any]:
@@ -114,51 +100,30 @@ def _picture(frame: LabelFrame) -> dict[str, Any]:
     }
 
 
-class _Visitor:
-    """The page of one visitor."""
-
+class _Visitor(Client):
     def __init__(self, page: LabelPage) -> None:
+        super().__init__(_MOST_WAITING)
         self._page = page
-        self._messages: deque[str | bytes] = deque()
-        self.news = asyncio.Event()
-
-    def take(self) -> str | bytes | None:
-        return self._messages.popleft() if self._messages else None
 
     def receive(self, message: str | bytes) -> None:
+        content, allowed = request_of(message, self._page.token)
         try:
-            content = parse_json(message)
-        except ValueError:
-            content = None
-        content = content if isinstance(content, dict) else {}
-        given = str(content.get("token")).encode("utf-8", "replace")
-        if not secrets.compare_digest(given, self._page.token.encode()):
-            self._tell({"failed": "open the whole address that toftrack label printed"})
-            return
-        try:
+            if not allowed:
+                raise ValueError("open the whole address that toftrack label printed")
             self._answer(content)
         except (ValueError, ToftrackError) as error:
-            self._tell({"failed": str(error)})
+            self.tell({"failed": str(error)})
 
     def _answer(self, content: dict[str, Any]) -> None:
         page = self._page
         if "about" in content:
-            self._tell({"about": page.about()})
+            self.tell({"about": page.about()})
         elif "frame" in content:
             number = content["frame"]
             frame = page.frames.get(number) if isinstance(number, int) else None
             if frame is None:
                 raise ValueError("there is no such frame here")
-            self._tell(_picture(frame), frame.depth_mm.tobytes())
+            self.tell(_picture(frame), frame.depth_mm.tobytes())
         else:
             page.change(content)
-            self._tell({"saved": page.labels.labelled()})
-
-    def _tell(self, facts: dict[str, Any], *more: bytes) -> None:
-        """Send facts and what follows, unless too much waits already."""
-        if len(self._messages) < _MOST_WAITING:
-            self._messages += (json.dumps(facts, allow_nan=False), *more)
-            self.news.set()
-
-    def __len__(self) -> int:
-        return len(self._messages)
+            self.tell({"saved": page.labels.labelled()})

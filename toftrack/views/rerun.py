@@ -1,4 +1,4 @@
-"""What `view=rerun` logs of each frame, and how the viewer opens.
+"""`view=rerun`: all that the tracker sees and believes, into a file or a running viewer.
 
 Entities, on the timelines `frame` (its number) and `time` (seconds of the recording):
 
@@ -19,6 +19,12 @@ The world is the camera's frame: x right, y down, z forward, metres.
 from __future__ import annotations
 
 import itertools
+import logging
+import queue
+import socket
+import threading
+from pathlib import Path
+from urllib.parse import urlsplit
 
 import cv2
 import numpy as np
@@ -27,16 +33,18 @@ from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
-from toftrack.errors import reported_errors
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
+from toftrack.safe_files import open_new
 from toftrack.tracking.state import StepInfo
-from toftrack.views.base import TrackedFrame, TrackedHand
+from toftrack.views.base import TrackedFrame, TrackedHand, View
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
+from toftrack.views.video import writing
 
 with reported_errors(
     "view=rerun needs the package rerun-sdk",
@@ -45,6 +53,152 @@ with reported_errors(
 ):
     import rerun as rr
     import rerun.blueprint as rrb
+
+FILE_NAME = "track.rrd"
+
+_log = logging.getLogger(__name__)
+_QUEUED_FRAMES = 30
+"""How many frames the tracker may be ahead of what is logged."""
+_ANSWER_S = 5.0
+"""How long a viewer may take to answer."""
+_PORT = 9876
+_ADDRESS = f"rerun+http://127.0.0.1:{_PORT}/proxy"
+_RERUN_ERRORS = (OSError, RuntimeError, ValueError)
+
+
+class RerunView(View):
+    """Writes the file track.rrd, or shows in a viewer while tracking goes on.
+
+    A thread of its own does the work, so that the tracker goes on at once. The file gets every
+    frame; a viewer that does not keep up misses some, and never holds up the tracker. The settings:
+    conf/view/rerun.yaml.
+
+    Raises ToftrackError when the file cannot be written, there is no viewer, or for both connect
+    and spawn.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        fps: float,
+        frames: int | None = None,
+        *,
+        likelihood: FMeasure,
+        connect: str | None = None,
+        spawn: bool = False,
+    ) -> None:
+        if connect and spawn:
+            raise ToftrackError("view.connect and view.spawn exclude each other; give one of them")
+        self._path = None if connect or spawn else Path(folder) / FILE_NAME
+        self._stream = rr.RecordingStream("toftrack")
+        if self._path is None:
+            if spawn:
+                _start_viewer(self._stream)
+            elif connect:
+                _require_answer(connect)
+            self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=_blueprint())
+        else:
+            with writing(self._path, *_RERUN_ERRORS):
+                open_new(self._path, replace=True).close()  # the library follows links
+                self._stream.save(self._path, default_blueprint=_blueprint())
+        self._entities = _Entities(self._stream, likelihood)
+        self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
+        self._left_out = 0
+        self._failure: Exception | None = None
+        # A daemon, because nothing frees a thread that waits for a viewer that is stuck.
+        self._thread = threading.Thread(target=self._work, name="toftrack-rerun", daemon=True)
+        self._thread.start()
+
+    def show(self, tracked: TrackedFrame) -> None:
+        """Hand one frame over; raises ToftrackError when one before it could not be logged."""
+        self._raise_failure()
+        if self._path is not None:
+            self._frames.put(tracked)
+            return
+        try:
+            self._frames.put_nowait(tracked)
+        except queue.Full:
+            self._left_out += 1
+
+    def close(self) -> None:
+        """Finish the file, or send the viewer what is left; ToftrackError when it cannot be done.
+
+        A second call does nothing.
+        """
+        patience_s = None if self._path is not None else _ANSWER_S
+        if self._thread.is_alive():
+            try:
+                self._frames.put(None, timeout=patience_s)
+                self._thread.join(patience_s and 2 * patience_s)
+            except queue.Full:
+                pass  # the thread is stuck, as is seen below
+        if self._left_out:
+            _log.warning("view=rerun: the viewer was too slow for %d frames", self._left_out)
+            self._left_out = 0
+        if self._thread.is_alive():
+            # What Rerun does when python ends would wait for the viewer, too.
+            rr.unregister_shutdown()
+            raise _viewer_gone("it takes nothing any more")
+        self._raise_failure()
+
+    def _work(self) -> None:
+        """In the thread: log the frames that come, until None, then finish."""
+        # After a failure, frames are still taken, so that nobody waits for room.
+        for tracked in iter(self._frames.get, None):
+            if self._failure is None:
+                try:
+                    self._entities.log(tracked)
+                except Exception as error:
+                    self._failure = error
+        try:
+            self._stream.flush(timeout_sec=_ANSWER_S)
+            self._stream.disconnect()
+        except Exception as error:
+            self._failure = self._failure or error
+
+    def _raise_failure(self) -> None:
+        if self._failure is None:
+            return
+        if self._path is None and isinstance(self._failure, _RERUN_ERRORS):
+            raise _viewer_gone(str(self._failure)) from self._failure
+        with writing(self._path or Path(FILE_NAME), *_RERUN_ERRORS):
+            raise self._failure
+
+
+def _start_viewer(stream: rr.RecordingStream) -> None:
+    """Start a viewer in a process of its own; ToftrackError when it does not answer."""
+    try:
+        stream.spawn(port=_PORT, connect=False)
+        _require_answer(_ADDRESS)
+    except (*_RERUN_ERRORS, ToftrackError) as error:
+        raise ToftrackError(
+            "view.spawn=true: no viewer could be started, is there a display? Leave it out, and "
+            f"open {FILE_NAME} with `rerun` afterwards"
+        ) from error
+
+
+def _require_answer(address: str) -> None:
+    """A connection is made in the background, and would be tried for ever."""
+    advice = "start one with `rerun` and give the address that it names, or leave out view.connect"
+    parts = urlsplit(address)
+    try:
+        host, port = parts.hostname, parts.port or _PORT
+    except ValueError:  # of a port that is no number
+        host, port = None, _PORT
+    if not parts.scheme.startswith("rerun") or not host:
+        raise ToftrackError(
+            f"view.connect={address} is no address of a viewer, as {_ADDRESS}; {advice}"
+        )
+    with reported_errors(f"no viewer answers at {address}", advice):
+        socket.create_connection((host, port), _ANSWER_S).close()
+
+
+def _viewer_gone(reason: str) -> ToftrackError:
+    return ToftrackError(
+        f"the viewer is gone ({reason}): what it had not received is missing there, the result "
+        "files are whole; start it again, or leave out view.connect and view.spawn"
+    )
+
 
 _STEPS_A_METRE = 5000.0
 """Depth goes out in whole steps of 0.2 mm, up to 13 m: half the size of floating point."""
@@ -63,20 +217,20 @@ _SKELETONS = ("world/hand/skeleton", "world/hand_2/skeleton")
 _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 
 
-class Entities:
-    """Logs frame after frame to a stream; one thread at a time.
-
-    likelihood: tells correct, false and missed pixels.
-    """
+class _Entities:
+    """Logs frame after frame to a stream; one thread at a time."""
 
     def __init__(self, stream: rr.RecordingStream, likelihood: FMeasure) -> None:
-        self._stream = stream
-        self._likelihood = likelihood
+        self._stream, self._log, self._likelihood = stream, stream.log, likelihood
         self._pinholes: dict[str, tuple[bytes, int, int]] = {}
         self._reported: dict[int, tuple[str, ...]] = {}
-        self._named: set[int] = set()
-        """Slots whose plots have names."""
-        self._log_constants()
+        self._named: set[str] = set()
+        """Plots whose lines have names."""
+        self._log("world", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
+        classes = [(n, name, CLASS_RGB[n]) for n, name in enumerate(CLASSES)]
+        for entity, labels in (("segmentation", _SEGMENTS), ("classified", classes)):
+            self._log(f"world/tracker/{entity}", rr.AnnotationContext(labels), static=True)
+        self._log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
 
     @small_operations()
     def log(self, tracked: TrackedFrame) -> None:
@@ -89,14 +243,17 @@ class Entities:
             self._log_slot(hand, slot)
             if len(tracked.hands) > 1:
                 self._log_label(hand.estimate, slot)
-        self._stream.log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
+        self._log("plots/time", rr.Scalars([1e3 * estimate.compute_s]))
+
+    def _clear(self, *entities: str) -> None:
+        for entity in entities:
+            self._log(entity, rr.Clear(recursive=False))
 
     def _log_slot(self, hand: TrackedHand, slot: int) -> None:
         of_hand, of_tracker = _of_slot("world/hand", slot), _of_slot("world/tracker", slot)
         if hand.insight is None:
-            for gone in (f"{of_tracker}/segmentation", f"{of_tracker}/classified"):
-                self._stream.log(gone, rr.Clear(recursive=False))
-            self._stream.log(f"{of_hand}/particles", rr.Clear(recursive=False))
+            of_image = f"{of_tracker}/segmentation", f"{of_tracker}/classified"
+            self._clear(*of_image, f"{of_hand}/particles")
         else:
             self._log_observation(of_tracker, hand, hand.insight.observation)
             self._log_particles(of_hand, hand.insight)
@@ -108,22 +265,11 @@ class Entities:
         """Whose hand it is, beside its wrist."""
         entity = f"{_of_slot('world/hand', slot)}/label"
         if is_vacant(estimate):
-            self._stream.log(entity, rr.Clear(recursive=False))
+            self._clear(entity)
             return
         words, colour = side_words(estimate) or "?", SLOT_RGB[slot]
-        label = rr.Points3D(
-            estimate.joints_m[:1], labels=[words], colors=[colour], radii=2 * _JOINT_M
-        )
-        self._stream.log(entity, label)
-
-    def _log_constants(self) -> None:
-        stream = self._stream
-        stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Y_DOWN, static=True)
-        stream.log("world/tracker/segmentation", rr.AnnotationContext(_SEGMENTS), static=True)
-        classes = tuple(enumerate(CLASSES))
-        context = rr.AnnotationContext([(n, name, CLASS_RGB[n]) for n, name in classes])
-        stream.log("world/tracker/classified", context, static=True)
-        stream.log("plots/time", rr.SeriesLines(names=["ms"], colors=[(0, 158, 115)]), static=True)
+        wrist = estimate.joints_m[:1]
+        self._log(entity, rr.Points3D(wrist, labels=[words], colors=[colour], radii=2 * _JOINT_M))
 
     def _log_pinhole(self, entity: str, k: np.ndarray, height: int, width: int) -> None:
         """The camera of an image, when it is not the one before."""
@@ -137,24 +283,23 @@ class Entities:
             camera_xyz=rr.ViewCoordinates.RDF,
             image_plane_distance=0.1,
         )
-        self._stream.log(entity, pinhole)
+        self._log(entity, pinhole)
 
     def _log_images(self, tracked: TrackedFrame) -> None:
         depth, camera = tracked.depth_m, tracked.camera
         self._log_pinhole("world/camera", camera.K, *depth.shape)
         steps = _STEPS_A_METRE * depth
-        near, far = (_STEPS_A_METRE * limit for limit in _SHOWN_M)
         image = rr.DepthImage(
             np.where(steps < 2**16, steps, 0).round().astype(np.uint16),
             meter=_STEPS_A_METRE,
-            depth_range=(near, far),
+            depth_range=[_STEPS_A_METRE * limit for limit in _SHOWN_M],
             colormap="viridis",
             point_fill_ratio=0.4,
         )
-        self._stream.log("world/camera/depth", image)
+        self._log("world/camera/depth", image)
         amplitude = camera.undistort_amplitude(tracked.frame.amplitude)
         if amplitude is not None:
-            self._stream.log("world/camera/amplitude", rr.Image(amplitude))
+            self._log("world/camera/amplitude", rr.Image(amplitude))
 
     def _log_observation(self, entity: str, tracked: TrackedHand, observation: Observation) -> None:
         """How each pixel of the tracker's own image counts."""
@@ -163,10 +308,9 @@ class Entities:
         self._log_pinhole(entity, observation.k.numpy(), *hand.shape)
         segments = hand.astype(np.uint8)
         segments[occluder] = 2
-        self._stream.log(f"{entity}/segmentation", rr.SegmentationImage(segments))
+        self._log(f"{entity}/segmentation", rr.SegmentationImage(segments))
         pixels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
-        labels = rr.SegmentationImage(pixels.labels())
-        self._stream.log(f"{entity}/classified", labels)
+        self._log(f"{entity}/classified", rr.SegmentationImage(pixels.labels()))
 
     def _log_particles(self, entity: str, insight: StepInfo) -> None:
         """The middles of the hands that the particles stand for, brighter with their weight."""
@@ -176,46 +320,39 @@ class Entities:
         shades = np.round(255 * weights / max(float(weights.max()), 1e-12)).astype(np.uint8)
         colours = cv2.applyColorMap(shades[:, None], cv2.COLORMAP_CIVIDIS)[:, 0, ::-1]
         points = rr.Points3D(middles.numpy(), colors=colours, radii=_PARTICLE_M)
-        self._stream.log(f"{entity}/particles", points)
+        self._log(f"{entity}/particles", points)
 
     def _log_hand(self, entity: str, tracked: TrackedHand) -> None:
-        estimate, log = tracked.estimate, self._stream.log
+        estimate = tracked.estimate
         if is_vacant(estimate):
-            for part in ("ellipsoids", "skeleton", "joints"):
-                log(f"{entity}/{part}", rr.Clear(recursive=False))
+            self._clear(*(f"{entity}/{part}" for part in ("ellipsoids", "skeleton", "joints")))
             return
-        log(f"{entity}/ellipsoids", ellipsoids(estimate, tracked.shape))
+        self._log(f"{entity}/ellipsoids", _ellipsoids(estimate, tracked.shape))
         joints = estimate.joints_m
-        strips, colours = bone_strips(joints, estimate.joint_ok | estimate.lost)
+        strips, colours = _bone_strips(joints, estimate.joint_ok | estimate.lost)
         lines = rr.LineStrips3D(strips, colors=colours, radii=_BONE_M / 2)
-        log(f"{entity}/skeleton", lines)
+        self._log(f"{entity}/skeleton", lines)
         colours = [_PALM_RGB, *(rgb for rgb in FINGER_RGB for _ in range(4))]
-        log(f"{entity}/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
+        self._log(f"{entity}/joints", rr.Points3D(joints, colors=colours, radii=_JOINT_M))
 
     def _log_plots(self, estimate: Estimate, slot: int) -> None:
-        values: dict[str, list[float]] = {
-            "score": [estimate.score, estimate.confidence, float(estimate.lost)],
-            "latent": estimate.latent.tolist(),
-            "pinch": [estimate.pinch],
-        }
-        if slot not in self._named:
-            self._named.add(slot)
-            self._name_plots(len(estimate.latent), slot)
-        for name, numbers in values.items():
-            self._stream.log(_plot(name, slot), rr.Scalars(numbers))
-
-    def _name_plots(self, dims: int, slot: int) -> None:
-        which = f", hand {slot + 1}" if slot else ""
-        coordinates = [f"coordinate {n}" for n in range(1, dims + 1)]
-        for plot, names, colours in (
-            ("score", ["score", "confidence", "lost"], _SCORE_RGB),
-            ("latent", coordinates, [FINGER_RGB[n % len(FINGER_RGB)] for n in range(dims)]),
-            ("pinch", ["pinch"], [FINGER_RGB[1]]),
+        latent = estimate.latent.tolist()
+        coordinates = [f"coordinate {n}" for n in range(1, len(latent) + 1)]
+        scores = [estimate.score, estimate.confidence, float(estimate.lost)]
+        which, below = (f", hand {slot + 1}", f"/hand_{slot + 1}") if slot else ("", "")
+        for plot, names, values, colours in (
+            ("score", ["score", "confidence", "lost"], scores, _SCORE_RGB),
+            ("latent", coordinates, latent, [FINGER_RGB[n % 5] for n in range(len(latent))]),
+            ("pinch", ["pinch"], [estimate.pinch], [FINGER_RGB[1]]),
         ):
-            # Paler, so that the first hand's lines are told from the others'.
-            shown = [tuple((c + 255) // 2 for c in rgb) if slot else rgb for rgb in colours]
-            lines = rr.SeriesLines(names=[f"{name}{which}" for name in names], colors=shown)
-            self._stream.log(_plot(plot, slot), lines, static=True)
+            entity = f"plots/{plot}{below}"
+            if entity not in self._named:
+                self._named.add(entity)
+                # Paler, so that the first hand's lines are told from the others'.
+                shown = [tuple((c + 255) // 2 for c in rgb) if slot else rgb for rgb in colours]
+                lines = rr.SeriesLines(names=[f"{name}{which}" for name in names], colors=shown)
+                self._log(entity, lines, static=True)
+            self._log(entity, rr.Scalars(values))
 
     def _log_changes(self, estimate: Estimate, slot: int) -> None:
         now = (estimate.state_name, gesture_words(estimate), str(estimate.lost))
@@ -227,18 +364,14 @@ class Entities:
         words = (which, lost, state_words(estimate), gesture_words(estimate))
         text = ", ".join(filter(None, words))
         level = rr.TextLogLevel.WARN if estimate.lost else rr.TextLogLevel.INFO
-        self._stream.log("log", rr.TextLog(text, level=level))
+        self._log("log", rr.TextLog(text, level=level))
 
 
 def _of_slot(entity: str, slot: int) -> str:
     return entity if slot == 0 else f"{entity}_{slot + 1}"
 
 
-def _plot(name: str, slot: int) -> str:
-    return f"plots/{name}" if slot == 0 else f"plots/{name}/hand_{slot + 1}"
-
-
-def bone_strips(
+def _bone_strips(
     joints_m: np.ndarray, ok: np.ndarray
 ) -> tuple[list[np.ndarray], list[tuple[int, int, int]]]:
     """Lines (n, 3), m, and their colours: a bone each, in dashes where its joint is not ok.
@@ -256,7 +389,7 @@ def bone_strips(
     return strips, colours
 
 
-def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
+def _ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
     """The posed hand without its wrist, in the fingers' colours; all in one when it is lost."""
     hand, _ = parted(posed_hand(estimate.state, shape))
     axes = hand.axes_m[0]
@@ -276,7 +409,7 @@ def ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
     )
 
 
-def blueprint() -> rrb.Blueprint:
+def _blueprint() -> rrb.Blueprint:
     """How the viewer opens: the scene in 3-D, the images beside it, and the plots below."""
     scene = rrb.Spatial3DView(
         origin="world",

@@ -1,12 +1,14 @@
-"""Hands as binary glTF: skeletons that move, and a skin on each.
+"""The hands of a run as skeletons that move, and as binary glTF, each with a skin.
 
-Metres; x right, y up, z backward. A node for each of the 26 joints of OpenXR with a key in every
-frame for its place and its turn. In frames without the hand its skeleton is scaled to nothing,
-which is how glTF hides what is animated; its pose is held there.
+Metres; x right, y up, z backward. In glTF a node for each of the 26 joints of OpenXR has a key in
+every frame for its place and its turn; in frames without the hand its skeleton is scaled to
+nothing, which is how glTF hides what is animated, and its pose is held.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from importlib.metadata import version
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -16,15 +18,131 @@ import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from toftrack.errors import module_of_extra
-from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
-from toftrack.hand.shape import HandShape
+from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS, openxr_hand, openxr_rig
+from toftrack.hand.shape import SIDES, HandShape
 from toftrack.hand.skeleton import FINGERS, forward_kinematics
 from toftrack.hand.surface import hand_surface
-from toftrack.output.exports.motion import HandMotion, rest_joints
+
+_WRIST = OPENXR_JOINT_NAMES.index("wrist")
+
+
+@dataclass(frozen=True, eq=False)
+class HandMotion:
+    """One hand over T frames: the 26 joints of OpenXR, each relative to the one it hangs on."""
+
+    slot: int
+    time_s: np.ndarray
+    """(T,) from 0 on, increasing."""
+    tracked: np.ndarray
+    """(T,) bool; elsewhere the pose is held from the frame before, or the first tracked one."""
+    offset_m: np.ndarray
+    """(T, 26, 3) in the axes of the joint that each hangs on; of the wrist in the world."""
+    turn: np.ndarray
+    """(T, 26, 4) unit quaternions x y z w likewise, without jumps of sign."""
+    rest_offset_m: np.ndarray
+    """(26, 3) of the straight hand at the origin."""
+    shape: HandShape
+    """Of the side that the hand had in most of its frames."""
+    suffix: str = ""
+    """Of its joints' names, where another hand has the same side."""
+
+    def name(self, joint: str) -> str:
+        """As the specification of OpenXR advises: "Index_Metacarpal_R"."""
+        return f"{joint.title()}_{self.shape.side[0].upper()}{self.suffix}"
+
+
+def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[HandMotion]:
+    """The hands of a track.npz that were tracked at all; shapes: the run's hands, one a slot.
+
+    In a frame that was dropped a hand stays as the row has it, which is as it was before. Raises
+    ToftrackError when no slot had a hand that was tracked.
+    """
+    arrays = {name: results[name] for name in ("lost", "joints_m", "state", "side")}
+    if arrays["lost"].ndim == 1:
+        arrays = {name: array[:, None] for name, array in arrays.items()}
+    time_s = _times(results["timestamp_s"])
+    found: list[HandMotion] = []
+    for slot in range(arrays["lost"].shape[1]):
+        hand = {name: array[:, slot] for name, array in arrays.items()}
+        motion = _motion(slot, hand, shapes[slot], time_s)
+        if motion is None:
+            continue
+        # What animates a hand finds its joints by their names.
+        if any(motion.shape.side == other.shape.side for other in found):
+            motion = replace(motion, suffix=f"_{slot + 1}")
+        found.append(motion)
+    if not found:
+        raise ToftrackError(
+            "no frame of this run has a hand that is not lost, so there is nothing to export"
+        )
+    return found
+
+
+def _relative(position: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Joints in the world (T, 26, 3) and (T, 26, 4), each in the axes of the one it hangs on."""
+    offset, turn = np.empty_like(position), np.empty_like(turned)
+    for joint, parent in enumerate(OPENXR_PARENTS):
+        if parent < 0:
+            offset[:, joint], turn[:, joint] = position[:, joint], turned[:, joint]
+            continue
+        back = Rotation.from_quat(turned[:, parent]).inv()
+        offset[:, joint] = back.apply(position[:, joint] - position[:, parent])
+        turn[:, joint] = (back * Rotation.from_quat(turned[:, joint])).as_quat()
+    return offset, turn
+
+
+def _rest_joints(shape: HandShape) -> tuple[np.ndarray, np.ndarray]:
+    """(26, 3) and (26, 4) of the straight hand with the wrist at the origin, in the world."""
+    rest = torch.zeros(1, 27, dtype=torch.float64)
+    joints = forward_kinematics(rest, shape.to("cpu", torch.float64)).joints_m.numpy()
+    hand = openxr_hand(joints[0], rest[0].numpy(), openxr_rig(shape))
+    return hand.position_m, hand.orientation
+
+
+def _motion(
+    slot: int, hand: dict[str, np.ndarray], shape: HandShape, time_s: np.ndarray
+) -> HandMotion | None:
+    """The motion of a slot's hand, None where it never had one."""
+    finite = np.isfinite(hand["joints_m"]).all((1, 2)) & np.isfinite(hand["state"]).all(1)
+    tracked = ~hand["lost"].astype(bool) & finite
+    if not tracked.any():
+        return None
+    side = hand["side"]
+    reported = list(side[tracked])
+    shape = shape.of_side(max(SIDES, key=reported.count) if any(reported) else shape.side)
+    held = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
+    held = np.where(held < 0, tracked.argmax(), held)
+    there = openxr_hand(hand["joints_m"], hand["state"], openxr_rig(shape))
+    # Until handedness was detected, or where a slot took another one.
+    (opposite,) = set(SIDES) - {shape.side}
+    other = side == opposite
+    mirrored = openxr_rig(shape.of_side(opposite))
+    as_other = openxr_hand(hand["joints_m"][other], hand["state"][other], mirrored)
+    there.position_m[other], there.orientation[other] = as_other.position_m, as_other.orientation
+    offset, turn = _relative(there.position_m[held], there.orientation[held])
+    position, turned = _rest_joints(shape)
+    rest_offset, _ = _relative(position[None], turned[None])
+    return HandMotion(slot, time_s, tracked, offset, _smooth_signum(turn), rest_offset[0], shape)
+
+
+def _smooth_signum(turn: np.ndarray) -> np.ndarray:
+    """(T, 26, 4) quaternions, each with the sign that lies nearer to the one before."""
+    agree = np.einsum("tjq,tjq->tj", turn[1:], turn[:-1]) >= 0
+    signum = np.cumprod(np.where(agree, 1.0, -1.0), axis=0)
+    return np.concatenate((turn[:1], turn[1:] * signum[..., None]))
+
+
+def _times(timestamp_s: np.ndarray) -> np.ndarray:
+    """(T,) from 0 on; where time stands still or goes back, frames of even length."""
+    steps = np.diff(timestamp_s)
+    if not (steps > 0).all():
+        step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1 / 25
+        return step * np.arange(len(timestamp_s))
+    return timestamp_s - timestamp_s[:1]
+
 
 _SKIN = [0.85, 0.6, 0.46, 1.0]
-_ROOT = OPENXR_JOINT_NAMES.index("wrist")
 
 
 def glb_of(motions: list[HandMotion]) -> bytes:
@@ -39,7 +157,7 @@ def _add_hand(file: _File, motion: HandMotion) -> None:
     """Nodes, skin, mesh and animation of one hand."""
     gltf = file.gltf
     first = len(file.document.nodes) + 1  # of the joints, behind the node that holds them
-    holder = gltf.Node(name=motion.name("hand"), children=[first + _ROOT])
+    holder = gltf.Node(name=motion.name("hand"), children=[first + _WRIST])
     file.document.nodes.append(holder)
     for joint, name in enumerate(OPENXR_JOINT_NAMES):
         children = [first + child for child, at in enumerate(OPENXR_PARENTS) if at == joint]
@@ -82,7 +200,7 @@ def _mesh(file: _File, motion: HandMotion) -> int:
 def _skin(file: _File, motion: HandMotion, first: int) -> int:
     """The number of the skin; its joints are the nodes from `first` on."""
     gltf = file.gltf
-    position, turned = rest_joints(motion.shape)
+    position, turned = _rest_joints(motion.shape)
     back = Rotation.from_quat(turned).inv()
     inverse = np.zeros((26, 4, 4))
     inverse[:, :3, :3] = back.as_matrix()
@@ -93,7 +211,7 @@ def _skin(file: _File, motion: HandMotion, first: int) -> int:
         gltf.Skin(
             name=motion.name("skin"),
             inverseBindMatrices=file.array(columns, gltf.MAT4),
-            skeleton=first + _ROOT,
+            skeleton=first + _WRIST,
             joints=list(range(first, first + 26)),
         )
     )
@@ -122,10 +240,7 @@ def _animate(file: _File, motion: HandMotion, first: int) -> None:
 
 
 class _File:
-    """A document that grows, with all its arrays in one buffer.
-
-    gltf: the module pygltflib.
-    """
+    """A document that grows, with all its arrays in one buffer; gltf: the module pygltflib."""
 
     def __init__(self, gltf: ModuleType) -> None:
         self.gltf: Any = gltf
@@ -145,9 +260,8 @@ class _File:
     def array(
         self, values: np.ndarray, kind: str, target: int | None = None, limits: bool = False
     ) -> int:
-        """Append an array; returns the number of its accessor. Floating ones become float32.
-
-        limits: say the least and the largest of each column.
+        """Append an array, floating ones as float32, with the least and the largest of each column
+        where asked; returns the number of its accessor.
         """
         types = {"u1": self.gltf.UNSIGNED_BYTE, "u4": self.gltf.UNSIGNED_INT}
         if values.dtype.kind == "f":
@@ -195,16 +309,16 @@ _JOINT_OF_FRAME = [
 
 
 class HandMesh(NamedTuple):
-    """A straight hand with its wrist at the origin, in the world of OpenXR.
-
-    points_m: (V, 3).  normals: (V, 3).  joint: (V,) of OpenXR, which each point moves with.
-    triangles: (F, 3) of points, anticlockwise seen from outside.
-    """
+    """A straight hand with its wrist at the origin, in the world of OpenXR."""
 
     points_m: np.ndarray
+    """(V, 3)."""
     normals: np.ndarray
+    """(V, 3)."""
     joint: np.ndarray
+    """(V,) of OpenXR, which each point moves with."""
     triangles: np.ndarray
+    """(F, 3) of points, anticlockwise seen from outside."""
 
 
 def hand_mesh(shape: HandShape) -> HandMesh:

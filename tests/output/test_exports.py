@@ -18,8 +18,7 @@ from toftrack.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.exports.glb import glb_of, hand_mesh
-from toftrack.output.exports.motion import motions_of
+from toftrack.output.exports import glb_of, hand_mesh, motions_of
 from toftrack.programs.export import bvh_of, csv_of
 
 NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")

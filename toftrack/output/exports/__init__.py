@@ -1,1 +1,0 @@
-"""Runs in formats that other programs open."""

@@ -1,1 +1,0 @@
-"""The run in the rerun viewer."""
