@@ -16,7 +16,6 @@ checkpoints.py).
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 import sys
 import time
@@ -44,11 +43,8 @@ from toftrack.training.batches import (
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
 from toftrack.training.images import (
     Crops,
-    CropScenes,
     WideImages,
     crop_images,
-    crop_scenes,
-    crops_on_device,
     wide_images,
 )
 from toftrack.training.losses import finder_loss, pose_losses
@@ -135,7 +131,7 @@ def train_poses(
     """Train the pose network on a device; returns the average of its weights, on the CPU, and the
     course.
 
-    On a CUDA device the pictures are taken there, and each step is a replay of the first one.
+    On a CUDA device each step is a replay of the first one.
     """
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
@@ -148,7 +144,7 @@ def train_poses(
 
     task = Task("poses", crop_images, losses)
     if device.type != "cpu":
-        task = Task("poses", crop_scenes, losses, _taker(device, seed), replayed=True)
+        task = Task("poses", crop_images, losses, _taker(device), replayed=True)
     return _train(network, task, schedule, shapes, seed, checkpoints, device)
 
 
@@ -204,20 +200,16 @@ class Task:
         return f"{network}.{restart and 'restart_'}images"
 
 
-def _taker(device: torch.device, seed: int) -> Callable[[CropScenes], Crops]:
-    """Makes crops of scenes on a CUDA device, beside the training there."""
-    stream: torch.cuda.Stream | None = None
-    seeds = itertools.count(seed + 1)
+def _taker(device: torch.device) -> Callable[[Crops], Crops]:
+    """Copies crops to a CUDA device, beside the training there."""
+    stream = torch.cuda.Stream(device)
 
-    def take(scenes: CropScenes) -> Crops:
-        nonlocal stream
-        stream = stream or torch.cuda.Stream(device)
+    def take(crops: Crops) -> Crops:
         with torch.cuda.stream(stream):
-            there = mapped(scenes, lambda one: on_device(one, device))
-            crops = crops_on_device(there, next(seeds))
+            there: Crops = mapped(crops, lambda one: on_device(one, device))
         # Whoever trains waits for nothing: these are ready before they are asked for.
         stream.synchronize()
-        return crops
+        return there
 
     return take
 

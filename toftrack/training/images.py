@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -27,8 +27,7 @@ from toftrack.training.hands import (
     random_views,
     turn,
 )
-from toftrack.training.images_numba import read_pictures
-from toftrack.training.pictures import Lens, Shots, random_sensors, shots, take, take_pictures
+from toftrack.training.pictures import Lens, random_sensors, read_pictures, take_pictures
 from toftrack.training.scenes import (
     Scenes,
     background_behind,
@@ -82,14 +81,18 @@ _HAND_M2 = 0.0105
 
 
 @dataclass(frozen=True, eq=False)
-class CropHands:
-    """The hands of N crops, in the crop's frame about its centre.
+class Crops:
+    """N crops, and their hands in the crop's frame about its centre.
 
-    present: (N,) there is a hand near the centre.  right: (N,) and it is a right one.
+    image: (N, CROP_CHANNELS, CROP, CROP).
+    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
+    present: (N,) a hand is seen near the centre.  right: (N,) and it is a right one.
     pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
     joints_m: (N, 21, 3).
     """
 
+    image: Tensor
+    parts: Tensor
     present: Tensor
     right: Tensor
     pivot_m: Tensor
@@ -97,34 +100,6 @@ class CropHands:
     angles: Tensor
     log_size: Tensor
     joints_m: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class Crops(CropHands):
-    """Crops and what is in them; `present`: and it is seen.
-
-    image: (N, CROP_CHANNELS, CROP, CROP).
-    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
-    """
-
-    image: Tensor
-    parts: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class CropScenes(CropHands):
-    """What crops show, before they are taken; `present`: seen or not.
-
-    shots: the pictures that crops are read of.  side: (N, 2) int32 pixels of such a picture and, in
-    its middle, of the crop.  distance_m: of the crops' centres.  turned: by how much crops are
-    turned, radians.  borders: (N, 2, 3) what lies in the image, see images_numba.
-    """
-
-    shots: Shots
-    side: Tensor
-    distance_m: Tensor
-    turned: Tensor
-    borders: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,44 +118,6 @@ class WideImages:
 
 def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     """n crops: most about a hand's middle, more or less; some about something else."""
-    return crops_of(crop_scenes(n, bank, generator))
-
-
-def crops_of(scenes: CropScenes) -> Crops:
-    """The crops of scenes on the CPU."""
-    depth, which = take(scenes.shots, (_WHOLE, _WHOLE))
-    image, parts = read_pictures(
-        depth,
-        which,
-        scenes.side.numpy(),
-        scenes.distance_m.numpy(),
-        scenes.turned.numpy(),
-        scenes.borders.numpy(),
-    )
-    return _crops(scenes, torch.from_numpy(image), torch.from_numpy(parts).long())
-
-
-def crops_on_device(scenes: CropScenes, seed: int) -> Crops:
-    """The crops of scenes that are on a CUDA device; seed: of the sensors' noise, with theirs."""
-    from toftrack.training import pictures_triton
-
-    depth, which = pictures_triton.take(scenes.shots, (_WHOLE, _WHOLE), seed)
-    image, parts = pictures_triton.read_pictures(
-        depth, which, scenes.side, scenes.distance_m, scenes.turned, scenes.borders
-    )
-    return _crops(scenes, image, parts)
-
-
-def _crops(scenes: CropScenes, image: Tensor, parts: Tensor) -> Crops:
-    parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
-    parts = torch.where(parts == THING, SEGMENTS - 1, parts)
-    visible = (parts == HAND).sum((1, 2)) >= 12
-    hands = {field.name: getattr(scenes, field.name) for field in fields(CropHands)}
-    return Crops(**hands | {"present": scenes.present & visible}, image=image, parts=parts)
-
-
-def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScenes:
-    """What n crops show, see crop_images."""
     dice = Dice(generator)
     distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
@@ -218,15 +155,17 @@ def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScen
     whole = (side * (turned.cos().abs() + turned.sin().abs())).ceil()
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
-    to_take = shots(scenes, lens, random_sensors(n, dice), dice)
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
+    sides = torch.stack((whole, side), 1).int()
+    borders = _borders(torch.where(gone, *_CUT), dice)
+    image, parts = read_pictures(depth, which, sides, distance, turned, borders)
+    parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
+    parts = torch.where(parts == THING, SEGMENTS - 1, parts)
     back = turn(turned, 2)  # from the crop's frame
-    return CropScenes(
-        shots=to_take,
-        side=torch.stack((whole, side), 1).int(),
-        distance_m=distance,
-        turned=turned,
-        borders=_borders(torch.where(gone, *_CUT), dice),
-        present=present,
+    return Crops(
+        image=image,
+        parts=parts,
+        present=present & ((parts == HAND).sum((1, 2)) >= 12),
         right=~left,
         pivot_m=((pivot - centre)[:, None] @ back)[:, 0],
         rotation=back.mT @ hands.rotation,
