@@ -160,13 +160,13 @@ def through_a_queue(batch: Any) -> Any:
     return batches.tensors(queue.get(timeout=60))
 
 
-def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
-    """On a CUDA device processes make scenes, and their pictures are taken beside the training."""
+def test_crops_that_come_from_another_process_are_the_same_but_for_the_precision_of_images() -> (
+    None
+):
     crops = images.crop_images(8, small_bank(), torch.Generator().manual_seed(0))
-    scenes = images.crop_scenes(8, small_bank(), torch.Generator().manual_seed(0))
-    sent = through_a_queue(scenes)
-    for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
-        assert torch.equal(one, other)
+    sent = through_a_queue(crops)
+    for one, other in zip(tensors_of(crops), tensors_of(sent), strict=True):
+        assert torch.equal(one.half() if one.ndim == 4 else one, other)
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

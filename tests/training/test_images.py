@@ -8,9 +8,9 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from helpers.detection import small_bank
+from helpers.detection import channels, small_bank
 
-from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.training.dice import Dice
@@ -24,8 +24,7 @@ from toftrack.training.images import (
     poorly_read,
     wide_images,
 )
-from toftrack.training.images_numba import read_pictures
-from toftrack.training.pictures import Lens
+from toftrack.training.pictures import Lens, read_pictures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -134,8 +133,9 @@ def test_crops_are_read_as_the_reference_reads_them() -> None:
     border = np.tile(np.array([1.0, 0.0, 9.0], np.float32), (n, 2, 1))
     border[2:, 0] = (0.0, 1.0, 0.1)
     border[3:, 1] = (-1.0, 0.0, 0.25)
-    sides = np.full((n, 2), side, np.int32)
-    image, parts = read_pictures(depth, labels, sides, distance, np.zeros(n), border)
+    sides = torch.full((n, 2), side, dtype=torch.int32)
+    lie = sides, torch.from_numpy(distance), torch.zeros(n), torch.from_numpy(border)
+    image, parts = (one.numpy() for one in read_pictures(depth, labels, *lie))
     steps = (np.arange(side) + 0.5) / side - 0.5
     inside = np.ones(depth.shape, bool)
     inside[2:] &= (steps < 0.1)[:, None]
@@ -153,10 +153,12 @@ def test_a_quarter_turn_of_a_crop_is_one_of_what_is_read_and_not_of_where_the_im
     side = 2 * CROP
     depth = generator.uniform(0.3, 0.7, (1, side, side)).astype(np.float32)
     labels = generator.integers(0, 5, depth.shape).astype(np.int8)
-    border = np.array([[[1.0, 0.0, 0.2], [1.0, 0.0, 9.0]]], np.float32)
-    sides, distance = np.full((1, 2), side, np.int32), np.full(1, 0.5, np.float32)
-    held, _ = read_pictures(depth, labels, sides, distance, np.zeros(1), border)
-    turned, _ = read_pictures(depth, labels, sides, distance, np.full(1, math.pi / 2), border)
+    border = torch.tensor([[[1.0, 0.0, 0.2], [1.0, 0.0, 9.0]]])
+    sides, distance = torch.full((1, 2), side, dtype=torch.int32), torch.tensor([0.5])
+    held, turned = (
+        read_pictures(depth, labels, sides, distance, torch.tensor([angle]), border)[0].numpy()
+        for angle in (0.0, math.pi / 2)
+    )
     # What was to the right is up: upright_angle of (1, 0).
     np.testing.assert_allclose(turned[0, :4], np.rot90(held[0, :4], 1, (1, 2)), atol=1e-5)
     assert held[0, 3, :, -5:].min() == 1 and turned[0, 3, :5].min() == 1
