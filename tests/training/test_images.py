@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -46,9 +45,8 @@ def test_crops_are_complete(crops: Crops) -> None:
     assert crops.image.abs().max() <= 1 and crops.image[:, 1:4].min() >= 0
     read = crops.image[:, 2] == 0
     assert torch.allclose(crops.image[:, 4:].mean(1)[read], crops.image[:, 0][read], atol=1e-5)
-    for field in fields(crops):
-        value = getattr(crops, field.name)
-        assert len(value) == N and value.isfinite().all(), field.name
+    for name, value in crops._asdict().items():
+        assert len(value) == N and value.isfinite().all(), name
     low, high = torch.tensor(ANGLE_LIMITS).unbind(1)
     assert (crops.angles >= low).all() and (crops.angles <= high).all()
     assert crops.parts.min() >= -1 and crops.parts.max() < SEGMENTS
@@ -75,8 +73,8 @@ def test_joints_lie_on_what_the_crop_shows() -> None:
 def test_whole_images_are_complete(images: WideImages) -> None:
     assert images.image.shape == (N, 2, *WIDE_SIZE)
     assert images.image.min() >= 0 and images.image.max() <= 1
-    for field in fields(images):
-        assert getattr(images, field.name).isfinite().all(), field.name
+    for name, value in images._asdict().items():
+        assert value.isfinite().all(), name
     assert (images.seen >= 0).all() and images.seen.max() < 3
     assert 0.5 < (images.seen[:, 0] > 0.15).float().mean() < 1, "some without a raised hand"
 

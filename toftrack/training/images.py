@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -80,8 +81,7 @@ _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
 
-@dataclass(frozen=True, eq=False)
-class Crops:
+class Crops(NamedTuple):
     """N crops, and their hands in the crop's frame about its centre.
 
     image: (N, CROP_CHANNELS, CROP, CROP).
@@ -102,8 +102,7 @@ class Crops:
     joints_m: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class WideImages:
+class WideImages(NamedTuple):
     """Whole images and the hands in them: the first is raised, the second another's.
 
     image: (N, 2, *WIDE_SIZE).  cell: (N, 2, 2) column and row of the middle of the palm in cells.
