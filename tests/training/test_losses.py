@@ -17,6 +17,7 @@ from toftrack.detector.network import (
     Proposed,
     cube_rotations,
 )
+from toftrack.training.dice import Dice
 from toftrack.training.hands import random_rotations
 from toftrack.training.images import WIDE_SIZE, Crops, WideImages, crop_images, wide_images
 from toftrack.training.losses import finder_loss, hypothesis_joints, pose_losses
@@ -31,7 +32,7 @@ def truth() -> Crops:
     """Mean hands of several sizes, all right ones that are there."""
     generator = torch.Generator().manual_seed(0)
     rotation = random_rotations(N, dice())
-    angles = shown_poses(N, generator)
+    angles = shown_poses(N, Dice(generator))
     log_size = 0.1 * torch.randn(N, generator=generator)
     pivot = 0.02 * torch.randn(N, 3, generator=generator)
     yes = torch.ones(N, dtype=torch.bool)
