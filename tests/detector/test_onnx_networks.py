@@ -107,9 +107,9 @@ def test_the_files_are_in_8_bits_and_say_so_and_bad_ones_are_refused(exported: P
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
         onnx_export.compare(other[0], models["pose"], crops)
     images = torch.rand(4, 2, 32, 48, generator=torch.Generator().manual_seed(0)).numpy()
-    onnx_export.compare_finder(finder.reference, models["finder"], images)
+    onnx_export.compare(finder.reference, models["finder"], images)
     with pytest.raises(ToftrackError, match=r"its spread away .* give --float"):
-        onnx_export.compare_finder(other[1], models["finder"], images)
+        onnx_export.compare(other[1], models["finder"], images)
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])

@@ -134,7 +134,7 @@ def _branches(middle: Tensor, dice: Dice) -> Tensor:
     thick, long = dice.uniform(n, low=0.004, high=0.018), dice.uniform(n, low=0.03, high=0.14)
     plane = dice.rotations(n)
     core = thick * dice.uniform(n, low=1.0, high=3.0)
-    pieces = [make_part(BALL, middle, plane, torch.stack((core), 1))]
+    pieces = [make_part(BALL, middle, plane, (core, 0 * core, 0 * core))]
     for _ in range(PIECES - 1):
         squeezed = torch.cat((dice.normal(n, 2), flat * dice.normal(n, 1)), 1)
         along = torch.nn.functional.normalize((squeezed[:, None] @ plane)[:, 0], dim=1)
