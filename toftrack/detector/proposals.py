@@ -147,7 +147,7 @@ def run_pose_network(
     crops.crop_rotation; None: crops as the camera is held. A network that learns hands that are
     upright, more or less, knows them better.
     """
-    crops = _crops(pose, depth_m, k, centres_m, side, up)
+    crops = _Crops(pose, depth_m, k, centres_m, side, up)
     rows = iter(range(len(crops.centres)))
     run_shared(lambda: crops.propose(rows), len(crops.centres) if _may_be_shared(pose) else 1)
     return crops.reported()
@@ -169,7 +169,7 @@ def start_pose_network(
     given = pose, depth_m, k, centre_m[None], side, None if up is None else up[None]
     if isinstance(pose, PoseNet) or not _may_be_shared(pose):
         return functools.partial(run_pose_network, *given)
-    crops = _crops(*given)
+    crops = _Crops(*given)
     image = crops.image(0)
     wait = beside(functools.partial(pose.outputs, image))
 
@@ -185,22 +185,33 @@ def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
     return isinstance(pose, OnnxPoseNet) and decode_at.is_compiled
 
 
-@dataclass(frozen=True, eq=False)
 class _Crops:
-    """Crops, and what is found in them.
-
-    left: depth, k and centres are, or are read, as a mirror shows them.
-    out: arrays of _SHAPES and the parts' kinds (C, PARTS, PARTS), written row by row.
+    """Crops, and what is found in them, in arrays of _SHAPES and of the parts' kinds, which are
+    written row by row.
     """
 
-    pose: PoseNet | OnnxPoseNet
-    depth: np.ndarray
-    left: bool
-    k: np.ndarray
-    centres: np.ndarray
-    rotations: list[np.ndarray]
-    hand: tuple[np.ndarray, ...]
-    out: tuple[np.ndarray, ...]
+    def __init__(
+        self,
+        pose: PoseNet | OnnxPoseNet,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        centres_m: np.ndarray,
+        side: str,
+        up: np.ndarray | None,
+    ) -> None:
+        self.pose, self.left, self.hand = pose, side == "left", _mean_hand(side)
+        self.depth = np.ascontiguousarray(depth_m, np.float32)
+        # Copies: numba compiles once more for arrays that must not be written to.
+        self.k = np.array(k, np.float64)
+        flip = _MIRROR if self.left else 1.0
+        self.centres = np.array(centres_m, np.float64).reshape(-1, 3) * flip
+        if self.left:  # depth, k and centres are, or are read, as a mirror shows them
+            self.k[0, 2] = depth_m.shape[1] - 1 - self.k[0, 2]
+        count = len(self.centres)
+        ups = [None] * count if up is None else list(np.asarray(up, np.float64) * flip)
+        self.rotations = list(map(crop_rotation, self.centres, ups))
+        self.numbers = tuple(np.empty((count, *one), np.float32) for one in _SHAPES.values())
+        self.kinds = np.empty((count, PARTS, PARTS), np.uint8)
 
     def propose(self, rows: Iterator[int]) -> None:
         """Of the next crop as long as there is one, which other threads may have taken.
@@ -220,41 +231,15 @@ class _Crops:
     def decode(self, row: int, image: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
         """Write what the network's outputs for a crop mean."""
         heads, keypoints, painted = outputs
-        *numbers, kinds = self.out
         place = self.rotations[row], self.centres[row], self.left
-        decode_at(heads[0], keypoints[0], image[0, 0], *place, self.hand, row, tuple(numbers))
-        kinds[row] = likeliest_parts(painted[0])
+        decode_at(heads[0], keypoints[0], image[0, 0], *place, self.hand, row, self.numbers)
+        self.kinds[row] = likeliest_parts(painted[0])
 
     def reported(self) -> NetworkOutput:
         """All that was written."""
-        *out, kinds = self.out
-        each = zip(kinds, self.rotations, self.centres, strict=True)
-        numbers = zip(_SHAPES, map(torch.from_numpy, out), strict=True)
+        each = zip(self.kinds, self.rotations, self.centres, strict=True)
+        numbers = zip(_SHAPES, map(torch.from_numpy, self.numbers), strict=True)
         return NetworkOutput(**dict(numbers), parts=tuple(Parts(*one, self.left) for one in each))
-
-
-def _crops(
-    pose: PoseNet | OnnxPoseNet,
-    depth_m: np.ndarray,
-    k: np.ndarray,
-    centres_m: np.ndarray,
-    side: str,
-    up: np.ndarray | None,
-) -> _Crops:
-    # Copies: numba compiles once more for arrays that must not be written to.
-    centres, k = np.array(centres_m, np.float64).reshape(-1, 3), np.array(k, np.float64)
-    ups = None if up is None else np.asarray(up, np.float64)
-    left = side == "left"
-    if left:
-        k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
-        centres = centres * _MIRROR
-        ups = None if ups is None else ups * _MIRROR
-    count = len(centres)
-    rotations = [crop_rotation(centres[c], None if ups is None else ups[c]) for c in range(count)]
-    numbers = [np.empty((count, *shape), np.float32) for shape in _SHAPES.values()]
-    out: tuple[np.ndarray, ...] = (*numbers, np.empty((count, PARTS, PARTS), np.uint8))
-    depth = np.ascontiguousarray(depth_m, np.float32)
-    return _Crops(pose, depth, left, k, centres, rotations, _mean_hand(side), out)
 
 
 @functools.cache

@@ -260,20 +260,20 @@ def _with_furniture(scenes: Scenes, centre_m: Tensor, gone: Tensor, dice: Dice) 
     pieces = furniture(there, centre_m + torch.cat((aside, behind), 1), dice)
     onto = centre_m + 0.02 * dice.normal(n, 3) - on_a_piece(pieces, dice)
     pieces[..., 1:4] += torch.where((gone & there)[:, None, None], onto[:, None], 0.0)
-    planes = scenes.planes.clone()
-    without_walls = gone & there & dice.chance(0.7, n)
-    planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
-    return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
+    return _with_pieces(scenes, pieces, gone & there & dice.chance(0.7, n))
 
 
 def furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
-    planes = scenes.planes.clone()
     without_walls = there & dice.chance(0.7, len(there))
+    pieces = furniture(there, before_camera(len(there), dice), dice)
+    return _with_pieces(scenes, pieces, without_walls)
+
+
+def _with_pieces(scenes: Scenes, pieces: Tensor, without_walls: Tensor) -> Scenes:
+    planes = scenes.planes.clone()
     planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
-    middle = before_camera(len(there), dice)
-    parts = torch.cat((scenes.parts, furniture(there, middle, dice)), 1)
-    return replace(scenes, planes=planes, parts=parts)
+    return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
 
 
 def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
@@ -323,26 +323,25 @@ def random_scenes(
     other: tuple[Hands, Tensor],
     dice: Dice,
     objects: float,
-    views: Tensor | None = None,
+    views: Tensor,
 ) -> Scenes:
     """Everything around a batch of hands.
 
     labels: (N, E) of the hands' ellipsoids.  other: second hands, and where there are any (N,).
     objects: probability of each of two things before or behind a hand.
-    views: (N,) where the cameras are, see scenes; None = before the persons.
+    views: (N,) where the cameras are.
     """
     n = len(labels)
     second, there = other
-    body = surroundings(hands, hands.pivot_m[:, 2], dice, views)
+    body = surroundings(hands, dice, views)
     stuff = things(hands.pivot_m, 2, objects, dice)
     other_labels = torch.where(there[:, None], second.labels, -1)
     centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
     axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
     planes = background_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
-    if views is not None:
-        # Whoever looks down sees a table, or the floor far below.
-        planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
-        planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
+    # Whoever looks down sees a table, or the floor far below.
+    planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
+    planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
     all_labels = torch.cat((labels, other_labels, body[2], stuff[2]), 1)
     covered = torch.cat((hands.skins.covered, second.skins.covered), 1)
     plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)

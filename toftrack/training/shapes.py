@@ -68,19 +68,17 @@ def shape_bank(count: int, generator: torch.Generator) -> ShapeBank:
     II), so that a real hand, whose surface is no set of ellipsoids, lies within them.
     """
     dice = Dice(generator)
-    hands = [_random_hand(dice) for _ in range(count)]
-    shape, surface = (
-        {name: torch.stack([getattr(one[part], name) for one in hands]) for name in names}
-        for part, names in enumerate(
-            (("base_m", "base_frames", "bone_lengths_m"), ("centres_m", "axes_m"))
-        )
+    shapes, surfaces = zip(*(_random_hand(dice) for _ in range(count)), strict=True)
+    shape = HandShape(
+        torch.stack([one.base_m for one in shapes]),
+        torch.stack([one.base_frames for one in shapes]),
+        torch.stack([one.bone_lengths_m for one in shapes]),
     )
-    lengths = torch.tensor([shape.hand_length_m for shape, _ in hands])
-    return ShapeBank(
-        HandShape(**shape),
-        HandSurface(hands[0][1].frame_index, **surface),
-        (lengths / DEFAULT_HAND_LENGTH_M).log(),
-    )
+    centres = torch.stack([one.centres_m for one in surfaces])
+    axes = torch.stack([one.axes_m for one in surfaces])
+    lengths = torch.tensor([one.hand_length_m for one in shapes])
+    surface = HandSurface(surfaces[0].frame_index, centres, axes)
+    return ShapeBank(shape, surface, (lengths / DEFAULT_HAND_LENGTH_M).log())
 
 
 def _random_hand(dice: Dice) -> tuple[HandShape, HandSurface]:
