@@ -327,6 +327,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     most = clamp_to_joint_limits(torch.deg2rad(most)).double()
     angles, parts = angles.double().contiguous(), parts.double().contiguous()
     flesh = ((0.013 + 0.0015 * dice.normal(n)) * size).double()
+    bones = (shape.base_frames, shape.base_m, shape.bone_lengths_m, radii, shifts)
     grasp(
         angles.numpy(),
         _doubles(thumbs),
@@ -335,9 +336,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
         tasks.contiguous().numpy(),
         power.numpy(),
         flesh.numpy(),
-        *(_doubles(x) for x in (shape.base_frames, shape.base_m, shape.bone_lengths_m)),
-        _doubles(radii),
-        _doubles(shifts),
+        tuple(map(_doubles, bones)),
         parts.numpy(),
         said.numpy(),
     )
