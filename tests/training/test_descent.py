@@ -138,7 +138,8 @@ def ends(*_: object) -> None:
 
 
 def test_a_process_that_ends_while_it_makes_batches_is_an_error() -> None:
-    with pytest.raises(ToftrackError, match="makes training images has ended"):
+    ended = pytest.raises(ToftrackError, match="makes training images has ended")
+    with ended, batches.makers_watched():
         next(batches.made_batches(Batches(ends, 2, 1, 0), range(2), 1))
 
 

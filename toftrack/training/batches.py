@@ -97,11 +97,19 @@ def made_batches(batches: Batches, numbers: range, makers: int) -> Iterator[Any]
         prefetch_factor=_READY,
         generator=torch.Generator(),
     )
+    for made in loader:
+        yield type(made)(*map(torch.from_numpy, made))
+
+
+@contextlib.contextmanager
+def makers_watched() -> Iterator[None]:
+    """Within, a ToftrackError where a process that makes batches has ended: torch raises that
+    wherever this one is.
+    """
     try:
-        for made in loader:
-            yield type(made)(*map(torch.from_numpy, made))
+        yield
     except RuntimeError as error:
-        if "exited unexpectedly" not in str(error):
+        if not str(error).startswith("DataLoader worker"):
             raise
         raise ToftrackError(
             "a process that makes training images has ended; is there enough memory?"

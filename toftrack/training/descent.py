@@ -31,7 +31,7 @@ from toftrack.compute.transfer import on_device
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import checksum
 from toftrack.errors import ToftrackError
-from toftrack.training.batches import Batches, keep_memory, made_batches, makers
+from toftrack.training.batches import Batches, keep_memory, made_batches, makers, makers_watched
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
 from toftrack.training.images import (
     Crops,
@@ -304,7 +304,7 @@ def _descend(
     numbers = range(progress.step, steps)
     batches = Batches(task.make, schedule.batch, shapes, seed)
     step = _Step(task, progress, device)
-    with bar:
+    with bar, makers_watched():
         for batch in made_batches(batches, numbers, makers(device)):
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
