@@ -192,8 +192,8 @@ def plain_scenes(
 
 
 def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
-    """Readings (N, 2 CROP, 2 CROP) in crop frames, and which lie in the image, as crops about centres
-    at distances (N,): the reference of crop_at and read_pictures.
+    """Readings (N, 2 CROP, 2 CROP) in crop frames, and which lie in the image, as crops about
+    centres at distances (N,): the reference of crop_at and read_pictures.
     """
     n = len(read_m)
     blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
