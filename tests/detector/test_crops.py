@@ -4,13 +4,22 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.detection import alone, clean_picture, intrinsics, one_hand, small_networks
+from helpers.detection import (
+    alone,
+    channels,
+    clean_picture,
+    intrinsics,
+    one_hand,
+    small_networks,
+)
 from helpers.tracking import sample
 
-from toftrack.detector import proposals, proposals_numba
+from toftrack.compute.rigid import PIVOT_M
+from toftrack.compute.rotations import rotmat_to_rotvec
 from toftrack.detector.crops import (
     CROP,
     CROP_CHANNELS,
@@ -18,16 +27,17 @@ from toftrack.detector.crops import (
     WIDE_F_PX,
     WIDE_LARGEST_PX,
     WIDE_MULTIPLE,
-    crop,
+    crop_at,
     crop_rotation,
     wide,
 )
-from toftrack.detector.network import STRIDE, Finder, Found
-from toftrack.detector.proposals import NetworkOutput, find_hands, mirrored
+from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
+from toftrack.detector.proposals import KEPT, NetworkOutput, Places, run_pose_network, start_finding
 from toftrack.detector.weights import load_weights
+from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.skeleton import forward_kinematics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-run_pose_network = proposals_numba.run_pose_network
 
 K = intrinsics(200.0, 144, 176)
 PRECOMPILED = np.array([[0.0, 0.0, 0.45]])
@@ -37,6 +47,87 @@ def numbers(seen: NetworkOutput) -> dict[str, torch.Tensor]:
     values = {name: getattr(seen, name) for name in NetworkOutput.__dataclass_fields__}
     values["parts"] = torch.stack([torch.from_numpy(one.kind) for one in seen.parts])
     return values
+
+
+def crop(depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray) -> np.ndarray:
+    """(CROP_CHANNELS, CROP, CROP)."""
+    image = np.empty((CROP_CHANNELS, CROP, CROP), np.float32)
+    crop_at(depth_m, False, k, centre_m, crop_rotation(centre_m), image)
+    return image
+
+
+def reference_crop(
+    depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, rotation: np.ndarray
+) -> np.ndarray:
+    """The same by OpenCV."""
+    distance, samples = float(np.linalg.norm(centre_m)), 2 * CROP
+    focal, middle = samples * distance / CROP_M, (samples - 1) / 2
+    pinhole = np.array([[focal, 0, middle], [0, focal, middle], [0, 0, 1]])
+    mapping = k @ rotation @ np.linalg.inv(pinhole)
+
+    def warped(image: np.ndarray) -> np.ndarray:
+        nearest = cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP
+        return cv2.warpPerspective(image, mapping, (samples, samples), flags=nearest)
+
+    # Z of the camera to z of the crop: along a ray d of the crop, z_crop = Z / (R d)_z.
+    steps = (np.arange(samples) - middle) / focal
+    slope = rotation[2, 0] * steps[None, :] + rotation[2, 1] * steps[:, None] + rotation[2, 2]
+    read = np.where(slope > 0.05, warped(depth_m) / np.maximum(slope, 0.05), 0).astype(np.float32)
+    inside = (warped(np.ones(depth_m.shape, np.uint8)) > 0) & (slope > 0.05)
+    return channels(read[None], inside[None], np.array([distance], np.float32))[0]
+
+
+@torch.inference_mode()
+def reference(
+    pose: PoseNet,
+    depth_m: np.ndarray,
+    k: np.ndarray,
+    centres_m: np.ndarray,
+    side: str,
+    up: np.ndarray | None,
+) -> dict[str, torch.Tensor]:
+    """What run_pose_network says, by PoseNet.decode of the reference's crops."""
+    flip = np.array([-1.0 if side == "left" else 1.0, 1.0, 1.0])
+    mirror, mirror_turn = torch.from_numpy(flip).float(), torch.from_numpy(flip[[1, 0, 0]]).float()
+    if side == "left":
+        depth_m, k = mirrored(depth_m, k)
+    ups = [None] * len(centres_m) if up is None else list(up * flip)
+    centres_m = centres_m * flip
+    turns = [crop_rotation(*one) for one in zip(centres_m, ups, strict=True)]
+    crops = [reference_crop(depth_m, k, *one) for one in zip(centres_m, turns, strict=True)]
+    p = pose(torch.from_numpy(np.stack(crops)))
+    turn, centre = torch.from_numpy(np.stack(turns)).float(), torch.from_numpy(centres_m).float()
+    order = p.log_probability.argsort(1, descending=True)[:, :KEPT]
+
+    def ordered(values: torch.Tensor) -> torch.Tensor:
+        return values[torch.arange(len(order))[:, None], order]
+
+    found = {name: ordered(getattr(p, name)) for name in ("angles", "log_size", "error_m")}
+    found["log_probability"] = ordered(p.log_probability)
+    found["pivot_m"] = (ordered(p.pivot_m) @ turn.mT + centre[:, None]) * mirror
+    found["rotvec"] = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation)) * mirror_turn
+    found["keypoints_m"] = (p.joints_m @ turn.mT + centre[:, None]) * mirror
+    flat = [found[name].flatten(0, 1) for name in ("rotvec", "angles")]
+    states = torch.cat((torch.zeros_like(flat[0]), *flat), 1)
+    hand = forward_kinematics(states, default_hand_shape(side=side))
+    away = hand.joints_m - (hand.frames[:, 0] @ torch.tensor(PIVOT_M))[:, None]
+    away = away.unflatten(0, order.shape) * found["log_size"].exp()[..., None, None]
+    found["joints_m"] = found["pivot_m"][:, :, None] + away
+    found |= {name: getattr(p, name) for name in ("sigma_m", "present", "right")}
+    return found | {"parts": p.parts.argmax(1).byte()}
+
+
+def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """An image as a mirror shows it, and its intrinsics."""
+    k = k.copy()
+    k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
+    return np.ascontiguousarray(depth_m[:, ::-1]), k
+
+
+def find_hands(
+    finder: Finder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
+) -> Places:
+    return start_finding(finder, depth_m, k, most, least)()
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.2, -0.1, 0.4), (-0.3, 0.3, 0.3)])
@@ -67,7 +158,7 @@ def test_a_crop_shows_depths_about_its_centre() -> None:
     rays = np.stack(np.meshgrid(np.arange(176), np.arange(144)), -1) - K[:2, 2]
     rays = np.concatenate((rays / K[0, 0], np.ones((144, 176, 1))), -1)
     depth = ((distance + 0.03) / (rays @ normal)).astype(np.float32)
-    image, _ = crop(depth, K, centre)
+    image = crop(depth, K, centre)
     assert image.shape == (CROP_CHANNELS, CROP, CROP) and image.dtype == np.float32
     u, v = (K @ centre)[:2] / centre[2]
     assert u > 120 and v < 60, "the image cuts the right of the crop"
@@ -75,26 +166,6 @@ def test_a_crop_shows_depths_about_its_centre() -> None:
     # Readings lie up to half a pixel, 1.3 mm, beside where they are taken to be.
     assert inner[0] == pytest.approx(0.03 / (CROP_M / 2), abs=0.02)
     assert (inner[1] == 1).all() and (inner[2] == 0).all()
-
-
-def test_what_is_not_in_the_cube_differs_from_what_is_not_read() -> None:
-    depth = np.full((144, 176), 2.0, np.float32)
-    depth[:, :88] = 0.0
-    image, _ = crop(depth, K, PRECOMPILED[0])
-    assert (image[1] == 0).all()
-    assert (image[2, :, : CROP // 2 - 1] == 1).all() and (image[2, :, CROP // 2 + 1 :] == 0).all()
-    assert (image[0] == 1).all()
-
-
-def test_the_last_channels_are_the_readings_whose_mean_the_first_one_is() -> None:
-    depth = (0.4 + 0.2 * np.random.default_rng(0).random((144, 176))).astype(np.float32)
-    depth[60:70] = 0.0
-    image, _ = crop(depth, K, PRECOMPILED[0])
-    whole, none = image[2] == 0, image[2] == 1
-    assert whole.any() and none.any()
-    assert image[4:].mean(0)[whole] == pytest.approx(image[0][whole], abs=1e-5)
-    assert (image[4:, none] == 1).all()
-    assert image[4:].std(0)[whole].mean() > 0.01, "pixels are larger than cells"
 
 
 def test_a_scene_at_two_resolutions_gives_the_same_crop() -> None:
@@ -105,7 +176,7 @@ def test_a_scene_at_two_resolutions_gives_the_same_crop() -> None:
         height, width = 144 * scale, 176 * scale
         k = intrinsics(200.0 * scale, height, width)
         depth = clean_picture(scene, k, height, width)[0][0]
-        crops.append(crop(depth, k, np.array(place))[0])
+        crops.append(crop(depth, k, np.array(place)))
     # Pixels on the outline fall to either side.
     assert np.median(np.abs(crops[1] - crops[0])[:2]) < 0.01
     assert np.abs(crops[1] - crops[0]).mean() < 0.03
@@ -157,6 +228,17 @@ def test_the_mirror_image_of_the_other_side_gives_mirrored_hypotheses(frame: int
         assert torch.allclose(reported, value, atol=1e-5), name
 
 
+@pytest.mark.parametrize("centre", [(0.05, -0.02, 0.4), (0.19, 0.0, 0.45), (0.0, -0.16, 0.45)])
+def test_a_crop_is_that_of_the_reference(centre: tuple[float, float, float]) -> None:
+    """With readings that are missing or beyond the cube, and beyond the image's border."""
+    depth = np.random.default_rng(0).uniform(0.2, 0.7, (144, 176)).astype(np.float32)
+    depth[60:70], depth[:, 80:84] = 0.0, 2.0
+    place = np.array(centre)
+    expected = reference_crop(depth, K, place, crop_rotation(place))
+    off = np.abs(crop(depth, K, place) - expected)
+    assert (off.max(0) < 1e-3).mean() > 0.95, "but for samples between two pixels"
+
+
 def distinct(log_probability: torch.Tensor) -> torch.Tensor:
     """(C, H) which hypotheses are not as likely as the one before or after: their order is sure."""
     apart = -log_probability.diff(dim=1) > 1e-3
@@ -174,9 +256,9 @@ def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> 
         centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
         up = np.random.default_rng(frame).normal(size=(4, 3)) if frame else None
         reported = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side, up)
-        expected = proposals.run_pose_network(pose, scene.depth_m[0], scene.k, centres, side, up)
-        ordered = distinct(expected.log_probability)
-        for name, value in numbers(expected).items():
+        expected = reference(pose, scene.depth_m[0], scene.k, centres, side, up)
+        ordered = distinct(expected["log_probability"])
+        for name, value in expected.items():
             if name == "parts":
                 continue
             both = numbers(reported)[name], value
@@ -185,19 +267,8 @@ def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> 
             # The file's weights hold the limits of the angles and the cells' places in half
             # precision, which only the reference uses.
             assert torch.allclose(*both, atol=1e-3, rtol=1e-3), name
-        same = numbers(reported)["parts"] == numbers(expected)["parts"]
+        same = numbers(reported)["parts"] == expected["parts"]
         assert same.float().mean() > 0.99, "but for classes that are as likely"
-
-
-def test_a_crop_says_what_lies_outside_of_the_image() -> None:
-    depth = np.zeros((144, 176), np.float32)
-    centre = np.array([0.19, 0.0, 0.45])
-    image, _ = crop(depth, K, centre)
-    border = image[3].mean(0)
-    assert border[0] == 0 and border[-1] == 1 and (np.diff(border) >= 0).all()
-    assert (image[2] == 1).all(), "where nothing is read in the image, either"
-    middle, _ = crop(depth, K, PRECOMPILED[0])
-    assert (middle[3] == 0).all()
 
 
 def strange_images() -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -266,7 +337,7 @@ def test_centres_at_the_border_and_beyond_it(centre: tuple[float, float, float])
     for side in ("right", "left"):
         found = run_pose_network(pose, depth, sample().k, np.array([centre]), side)
         assert all(value.isfinite().all() for value in numbers(found).values())
-    image, _ = crop(depth, sample().k, np.array(centre))
+    image = crop(depth, sample().k, np.array(centre))
     assert np.isfinite(image).all()
     if abs(centre[0]) > 1:
         assert (image[2] == 1).all(), "nothing is read there"

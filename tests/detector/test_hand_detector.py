@@ -23,8 +23,6 @@ from toftrack.hand.skeleton import forward_kinematics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
-HEIGHT, WIDTH = sample().depth_m.shape[1:]
-
 
 def detector(**changes: float) -> HandDetector:
     return HandDetector(*small_networks(), detector_settings(**changes))
@@ -133,19 +131,6 @@ def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
         assert merit(replace(seen, **better), 0.5) > merit(seen, 0.5)
     nothing = replace(seen, present=0.0, right_side=0.0)
     assert math.isfinite(merit(nothing, 0.0))
-
-
-@pytest.mark.parametrize(
-    "image",
-    [np.zeros((HEIGHT, WIDTH)), np.full((HEIGHT, WIDTH), np.nan), np.full((3, 3), 0.4)],
-    ids=["no readings", "no numbers", "3 x 3"],
-)
-def test_strange_images_are_searched_without_an_error(image: np.ndarray) -> None:
-    here, shown = detector(merit=-1e6, least=0.0), image.astype(np.float32)
-    for side in ("right", "left"):
-        places = here.start_search(shown, sample().k)()
-        for seen in here.look(shown, sample().k, places, side):
-            assert seen.joints_m.isfinite().all() and seen.keypoints.points_m.isfinite().all()
 
 
 @pytest.mark.parametrize("known", [0, 3])

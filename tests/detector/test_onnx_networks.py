@@ -15,12 +15,12 @@ from helpers.configured import detector_settings
 from helpers.detection import small_networks
 from helpers.tracking import sample
 
-from toftrack.detector import onnx_networks, proposals
+from toftrack.detector import onnx_networks
 from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, digest, load_networks
-from toftrack.detector.proposals_numba import run_pose_network
+from toftrack.detector.proposals import run_pose_network
 from toftrack.detector.weights import DEFAULT_FILE, save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training import onnx_export
@@ -85,9 +85,7 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
     centres = scene.joints_m[0, [0, 9]]
     for side in ("right", "left"):
         found = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side)
-        expected = proposals.run_pose_network(
-            pose.reference, scene.depth_m[0], scene.k, centres, side
-        )
+        expected = run_pose_network(pose.reference, scene.depth_m[0], scene.k, centres, side)
         away = (found.keypoints_m - expected.keypoints_m).norm(dim=-1).mean()
         assert float(away) < (0.003 if side == "right" else 0.010), "of the other side it guesses"
     image, _ = wide(scene.depth_m[0], scene.k)
@@ -109,9 +107,9 @@ def test_the_files_are_in_8_bits_and_say_so_and_bad_ones_are_refused(exported: P
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
         onnx_export.compare(other[0], models["pose"], crops)
     images = torch.rand(4, 2, 32, 48, generator=torch.Generator().manual_seed(0)).numpy()
-    onnx_export.compare_finder(finder.reference, models["finder"], images)
+    onnx_export.compare(finder.reference, models["finder"], images)
     with pytest.raises(ToftrackError, match=r"its spread away .* give --float"):
-        onnx_export.compare_finder(other[1], models["finder"], images)
+        onnx_export.compare(other[1], models["finder"], images)
 
 
 @pytest.mark.parametrize("network", ["pose", "finder"])

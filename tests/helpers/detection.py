@@ -12,6 +12,7 @@ from helpers.configured import detector_settings
 from torch import nn
 
 from toftrack.compute.rigid import rotated_pivot
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.hand_detector import Detection
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.proposals import Places
@@ -180,3 +181,25 @@ def plain_scenes(
     """Ellipsoids and planes alone."""
     skinned, parts = torch.zeros_like(labels, dtype=torch.bool), torch.zeros(len(labels), 0, PART)
     return Scenes(centres_m, axes_m, labels, planes, skinned, (), parts)
+
+
+def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
+    """Readings (N, 2 CROP, 2 CROP) in crop frames, and which lie in the image, as crops about
+    centres at distances (N,): the reference of crop_at and read_pictures.
+    """
+    n = len(read_m)
+    blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
+    valid = blocks > 0
+    relative = (blocks - distance_m[:, None, None, None, None]) * np.float32(2 / CROP_M)
+    near = valid & (np.abs(relative) < 1)
+    count = valid.sum((2, 4), dtype=np.float32)
+    total = np.where(valid, relative.clip(-1, 1), 0).sum((2, 4), dtype=np.float32)
+    out = np.empty((n, CROP_CHANNELS, CROP, CROP), np.float32)
+    out[:, 0] = np.where(count > 0, total / np.maximum(count, 1), 1.0)
+    out[:, 1] = near.sum((2, 4), dtype=np.float32) * np.float32(0.25)
+    out[:, 2] = 1 - count * np.float32(0.25)
+    within = inside.reshape(blocks.shape).sum((2, 4), dtype=np.float32)
+    out[:, 3] = 1 - within * np.float32(0.25)
+    each = np.where(valid, relative.clip(-1, 1), np.float32(1))
+    out[:, 4:] = each.transpose(0, 2, 4, 1, 3).reshape(n, 4, CROP, CROP)
+    return out

@@ -37,7 +37,8 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
     network = torch.nn.Linear(2, 2)
     progress = Progress(network, network, torch.optim.AdamW(network.parameters()), 24)
     resumed = Checkpoints(tmp_path, 1.0, resume=tmp_path)
-    save(resumed.path("poses"), progress, {"batch": 24, "seed": 0})
+    path = tmp_path / "poses.checkpoint.pt"
+    save(path, progress, {"batch": 24, "seed": 0})
     resumed.restore("poses", progress, {"batch": 24, "seed": 0})
     with pytest.raises(ToftrackError, match="a training with batch=24, and now it is 32"):
         resumed.restore("poses", progress, {"batch": 32, "seed": 0})
@@ -46,7 +47,7 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match=r"poses.checkpoint.pt is no checkpoint"):
         resumed.restore("poses", wrong, {"batch": 24})
     for content in (b"PK no archive", pickle.dumps({"settings": Path()}), b""):
-        resumed.path("poses").write_bytes(content)
+        path.write_bytes(content)
         with pytest.raises(ToftrackError, match="is no checkpoint"):
             resumed.restore("poses", progress, {})
     with pytest.raises(ToftrackError, match="there is no checkpoint"):

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 import json
-import multiprocessing
+import os
 import subprocess
 import sys
-import threading
-from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers import programs
-from helpers.detection import small_bank
 from helpers.tracking import ROOT
 
 from toftrack.detector.network import Finder, PoseNet
@@ -24,7 +20,7 @@ from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networ
 from toftrack.detector.weights import load_weights, save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training import batches, checkpoints, descent, images
-from toftrack.training.batches import tensors_of
+from toftrack.training.batches import Batches
 from toftrack.training.checkpoints import Checkpoints, Progress
 from toftrack.training.descent import Schedule, train_finder, train_poses
 
@@ -127,46 +123,24 @@ def test_a_restart_that_was_interrupted_ends_with_the_same_weights(
     assert [row["loss"] for row in course] == [row["loss"] for row in other]
 
 
-def test_batches_come_in_order_from_a_thread_that_ends_with_whoever_asks() -> None:
-    def numbers() -> Generator[int]:
-        try:
-            yield from range(100)
-        finally:
-            ended.set()
-
-    for asked in (3, 100):
-        ended = threading.Event()
-        with batches.prefetched(numbers(), lambda number: 2 * number) as ready:
-            found = list(itertools.islice(ready, asked))
-        assert found == list(range(0, 2 * asked, 2))
-        assert ended.wait(5), "what makes the batches is told to end"
+def test_batches_are_those_of_their_numbers_whichever_process_makes_them() -> None:
+    made = Batches(images.wide_images, 2, 6, 0)
+    found = list(batches.made_batches(made, range(3, 6), 2))
+    assert len(found) == 3 and found[0].image.dtype == torch.float16
+    for number, batch in zip(range(3, 6), found, strict=True):
+        for one, other in zip(batch, made[number], strict=True):
+            assert np.array_equal(one.numpy(), other)
+    assert not np.array_equal(made[3].image, made[4].image)
 
 
-def test_what_goes_wrong_while_batches_are_made_reaches_whoever_asks() -> None:
-    def numbers() -> Generator[int]:
-        yield 1
-        raise ToftrackError("no memory")
-
-    with batches.prefetched(numbers(), None) as ready:
-        assert next(ready) == 1
-        with pytest.raises(ToftrackError, match="no memory"):
-            next(ready)
+def ends(*_: object) -> None:
+    os._exit(1)
 
 
-def through_a_queue(batch: Any) -> Any:
-    """As it comes from a process that makes it."""
-    queue = multiprocessing.get_context("spawn").Queue()
-    queue.put(batches.arrays(batch))
-    return batches.tensors(queue.get(timeout=60))
-
-
-def test_scenes_that_were_sent_to_another_process_give_the_same_crops() -> None:
-    """On a CUDA device processes make scenes, and their pictures are taken beside the training."""
-    crops = images.crop_images(8, small_bank(), torch.Generator().manual_seed(0))
-    scenes = images.crop_scenes(8, small_bank(), torch.Generator().manual_seed(0))
-    sent = through_a_queue(scenes)
-    for one, other in zip(tensors_of(crops), tensors_of(images.crops_of(sent)), strict=True):
-        assert torch.equal(one, other)
+def test_a_process_that_ends_while_it_makes_batches_is_an_error() -> None:
+    ended = pytest.raises(ToftrackError, match="makes training images has ended")
+    with ended, batches.makers_watched():
+        next(batches.made_batches(Batches(ends, 2, 1, 0), range(2), 1))
 
 
 def test_the_rate_rises_stays_and_falls_to_nothing() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.training.fit_joint_flags import Tips, chosen, halves, is_shown, lines, rates
+from toftrack.training.fit_joint_flags import Tips, chosen, is_shown, rates, report
 
 
 def tips(count: int = 4000, seed: int = 0) -> Tips:
@@ -26,9 +26,10 @@ def test_the_share_of_right_tips_that_are_flagged_is_kept_on_the_other_half() ->
     other = rates(there, least)
     assert other["right_flagged_pct"] == pytest.approx(5, abs=2)
     assert other["wrong_flagged_pct"] > 15 and other["wrong"] == there.wrong.sum()
-    report = halves(tips(), True, right_pct=5)
-    assert report["shown_on"] == other and lines(report)[0] == f"joint_ok: {least:g}"
-    assert halves(tips(), False, right_pct=5)["shown_on"]["wrong"] == here.wrong.sum()
+    joint_ok, _, shown = report(tips(), True, right_pct=5).splitlines()
+    assert joint_ok == f"joint_ok: {least:g}"
+    assert f"{other['wrong_flagged_pct']} % of {other['wrong']} wrong tips flagged" in shown
+    assert f"of {here.wrong.sum()} wrong" in report(tips(), False, 5).splitlines()[2]
 
 
 def test_without_a_right_tip_nothing_can_be_chosen() -> None:

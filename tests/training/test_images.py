@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
-from helpers.detection import small_bank
+from helpers.detection import channels, small_bank
 
-from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M, channels
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 from toftrack.hand.skeleton import ANGLE_LIMITS
 from toftrack.training.dice import Dice
@@ -24,8 +23,7 @@ from toftrack.training.images import (
     poorly_read,
     wide_images,
 )
-from toftrack.training.images_numba import read_pictures
-from toftrack.training.pictures import Lens
+from toftrack.training.pictures import Lens, read_pictures
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -47,9 +45,8 @@ def test_crops_are_complete(crops: Crops) -> None:
     assert crops.image.abs().max() <= 1 and crops.image[:, 1:4].min() >= 0
     read = crops.image[:, 2] == 0
     assert torch.allclose(crops.image[:, 4:].mean(1)[read], crops.image[:, 0][read], atol=1e-5)
-    for field in fields(crops):
-        value = getattr(crops, field.name)
-        assert len(value) == N and value.isfinite().all(), field.name
+    for name, value in crops._asdict().items():
+        assert len(value) == N and value.isfinite().all(), name
     low, high = torch.tensor(ANGLE_LIMITS).unbind(1)
     assert (crops.angles >= low).all() and (crops.angles <= high).all()
     assert crops.parts.min() >= -1 and crops.parts.max() < SEGMENTS
@@ -76,8 +73,8 @@ def test_joints_lie_on_what_the_crop_shows() -> None:
 def test_whole_images_are_complete(images: WideImages) -> None:
     assert images.image.shape == (N, 2, *WIDE_SIZE)
     assert images.image.min() >= 0 and images.image.max() <= 1
-    for field in fields(images):
-        assert getattr(images, field.name).isfinite().all(), field.name
+    for name, value in images._asdict().items():
+        assert value.isfinite().all(), name
     assert (images.seen >= 0).all() and images.seen.max() < 3
     assert 0.5 < (images.seen[:, 0] > 0.15).float().mean() < 1, "some without a raised hand"
 
@@ -134,8 +131,9 @@ def test_crops_are_read_as_the_reference_reads_them() -> None:
     border = np.tile(np.array([1.0, 0.0, 9.0], np.float32), (n, 2, 1))
     border[2:, 0] = (0.0, 1.0, 0.1)
     border[3:, 1] = (-1.0, 0.0, 0.25)
-    sides = np.full((n, 2), side, np.int32)
-    image, parts = read_pictures(depth, labels, sides, distance, np.zeros(n), border)
+    sides = torch.full((n, 2), side, dtype=torch.int32)
+    lie = sides, torch.from_numpy(distance), torch.zeros(n), torch.from_numpy(border)
+    image, parts = (one.numpy() for one in read_pictures(depth, labels, *lie))
     steps = (np.arange(side) + 0.5) / side - 0.5
     inside = np.ones(depth.shape, bool)
     inside[2:] &= (steps < 0.1)[:, None]
@@ -153,10 +151,12 @@ def test_a_quarter_turn_of_a_crop_is_one_of_what_is_read_and_not_of_where_the_im
     side = 2 * CROP
     depth = generator.uniform(0.3, 0.7, (1, side, side)).astype(np.float32)
     labels = generator.integers(0, 5, depth.shape).astype(np.int8)
-    border = np.array([[[1.0, 0.0, 0.2], [1.0, 0.0, 9.0]]], np.float32)
-    sides, distance = np.full((1, 2), side, np.int32), np.full(1, 0.5, np.float32)
-    held, _ = read_pictures(depth, labels, sides, distance, np.zeros(1), border)
-    turned, _ = read_pictures(depth, labels, sides, distance, np.full(1, math.pi / 2), border)
+    border = torch.tensor([[[1.0, 0.0, 0.2], [1.0, 0.0, 9.0]]])
+    sides, distance = torch.full((1, 2), side, dtype=torch.int32), torch.tensor([0.5])
+    held, turned = (
+        read_pictures(depth, labels, sides, distance, torch.tensor([angle]), border)[0].numpy()
+        for angle in (0.0, math.pi / 2)
+    )
     # What was to the right is up: upright_angle of (1, 0).
     np.testing.assert_allclose(turned[0, :4], np.rot90(held[0, :4], 1, (1, 2)), atol=1e-5)
     assert held[0, 3, :, -5:].min() == 1 and turned[0, 3, :5].min() == 1

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import roma
 import torch
@@ -19,6 +17,7 @@ from toftrack.detector.network import (
     Proposed,
     cube_rotations,
 )
+from toftrack.training.dice import Dice
 from toftrack.training.hands import random_rotations
 from toftrack.training.images import WIDE_SIZE, Crops, WideImages, crop_images, wide_images
 from toftrack.training.losses import finder_loss, hypothesis_joints, pose_losses
@@ -33,7 +32,7 @@ def truth() -> Crops:
     """Mean hands of several sizes, all right ones that are there."""
     generator = torch.Generator().manual_seed(0)
     rotation = random_rotations(N, dice())
-    angles = shown_poses(N, generator)
+    angles = shown_poses(N, Dice(generator))
     log_size = 0.1 * torch.randn(N, generator=generator)
     pivot = 0.02 * torch.randn(N, 3, generator=generator)
     yes = torch.ones(N, dtype=torch.bool)
@@ -104,7 +103,7 @@ def test_the_poses_of_left_and_absent_hands_are_not_trained() -> None:
     crops = truth()
     left = torch.zeros(N, dtype=torch.bool)
     left[2:4] = True
-    crops = replace(crops, right=~left)
+    crops = crops._replace(right=~left)
     right = perfect(crops)
     moved = right.pivot_m.clone()
     moved[left] += 0.1
@@ -138,7 +137,7 @@ def found_at(images: WideImages) -> Found:
 
 def test_a_finder_that_knows_loses_little() -> None:
     images = wide_images(8, small_bank(), torch.Generator().manual_seed(5))
-    images = replace(images, seen=images.seen * torch.tensor([1.0, 0.0]))  # one hand in each
+    images = images._replace(seen=images.seen * torch.tensor([1.0, 0.0]))  # one hand in each
     known = found_at(images)
     blind = known._replace(heat=torch.full_like(known.heat, -5.0))
     wrong = known._replace(log_depth=known.log_depth + 0.5)
@@ -148,7 +147,7 @@ def test_a_finder_that_knows_loses_little() -> None:
 
 def test_a_finder_learns_from_images_without_any_hand() -> None:
     images = wide_images(4, small_bank(), torch.Generator().manual_seed(5))
-    images = replace(images, seen=torch.zeros_like(images.seen))
+    images = images._replace(seen=torch.zeros_like(images.seen))
     quiet = found_at(images)
     loud = quiet._replace(heat=torch.zeros_like(quiet.heat))
     assert float(finder_loss(quiet, images)) < 0.01 < float(finder_loss(loud, images))

@@ -68,19 +68,3 @@ def test_it_learns_a_function_faster_than_it_began() -> None:
         optimiser.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.1 * losses[0]
-
-
-def test_a_step_asks_its_closure_for_gradients_and_returns_the_loss() -> None:
-    network = network_of(0)
-    optimiser = Muon(network, [network[0].weight, network[4].weight], 0.01, 0.1)
-    before = network[2].weight.clone()
-
-    def closure() -> torch.Tensor:
-        optimiser.zero_grad()
-        loss = network(torch.ones(2, 6)).square().mean()
-        loss.backward()
-        return loss
-
-    first, second = optimiser.step(closure), optimiser.step(closure)
-    assert second < first and not torch.equal(network[2].weight, before)
-    assert optimiser.step() is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from helpers.detection import dice
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
@@ -16,31 +17,27 @@ N = 400
 NAMES = [shown.name for shown in poses.SHOWN]
 
 
-def generator(seed: int = 0) -> torch.Generator:
-    return torch.Generator().manual_seed(seed)
-
-
 def joints(name: str) -> torch.Tensor:
     """(N, 21, 3) of default hands that show something, metres."""
     rows = torch.full((N,), NAMES.index(name))
-    angles = clamp_to_joint_limits(poses.shown_only(N, generator(), rows))
+    angles = clamp_to_joint_limits(poses.shown_only(N, dice(), rows))
     state = torch.cat((torch.zeros(N, 6), angles), 1)
     return forward_kinematics(state, default_hand_shape()).joints_m
 
 
 def test_poses_are_within_the_limits_and_the_same_again_from_a_seed() -> None:
-    angles = poses.shown_poses(N, generator())
+    angles = poses.shown_poses(N, dice())
     low, high = torch.tensor(ANGLE_LIMITS).unbind(1)
     assert angles.shape == (N, 21) and angles.isfinite().all()
     assert (angles >= low).all() and (angles <= high).all()
-    assert torch.equal(angles, poses.shown_poses(N, generator()))
-    assert not torch.equal(angles, poses.shown_poses(N, generator(1)))
+    assert torch.equal(angles, poses.shown_poses(N, dice()))
+    assert not torch.equal(angles, poses.shown_poses(N, dice(1)))
 
 
 def test_the_tips_of_a_fist_lie_on_the_palm_also_over_knuckles_that_are_hardly_bent() -> None:
     """Palms are 13 mm and tips 7 mm thick on that side of the bones, of a hand of 190 mm."""
     bent = clamp_to_joint_limits(
-        poses.shown_only(N, generator(), torch.full((N,), NAMES.index("fist")))
+        poses.shown_only(N, dice(), torch.full((N,), NAMES.index("fist")))
     )[:, 6::4].rad2deg()
     flat = bent.mean(1) < 55
     assert 0.2 < float(flat.float().mean()) < 0.5
@@ -80,7 +77,7 @@ def test_the_thumb_pinches_with_every_finger() -> None:
     pairs = poses.touching_pairs()
     assert min(len(thumbs) for thumbs, _ in pairs) > 20
     flat = torch.zeros(N, 21)
-    pinched = poses.pinched(flat, generator())
+    pinched = poses.pinched(flat, dice())
     state = torch.cat((torch.zeros(N, 6), pinched), 1)
     tips = forward_kinematics(state, default_hand_shape()).joints_m[:, 4::4]
     gaps = (tips[:, 1:] - tips[:, :1]).norm(dim=2)

@@ -26,7 +26,7 @@ N = 6
 def hands(name: str, seed: int = 0, left: bool = False) -> Hands:
     """Several hands that show something, their palms to the camera."""
     rows = torch.full((N,), [shown.name for shown in SHOWN].index(name))
-    angles = clamp_to_joint_limits(shown_only(N, torch.Generator().manual_seed(seed), rows))
+    angles = clamp_to_joint_limits(shown_only(N, dice(seed), rows))
     place = torch.tensor([[0.0, 0.0, 0.45]]).expand(N, 3)
     sides = torch.full((N,), left)
     rotation = torch.eye(3).expand(N, 3, 3)

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 import math
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
+
+from toftrack.compute.compiling import compiled, entry_point
 
 CROP_M = 0.30
 """Side of the cube that a crop shows."""
 CROP = 64
 """Cells of a crop, each of 2 x 2 readings."""
 CROP_CHANNELS = 8
-"""Of a crop, see `channels`."""
+"""Of a crop, see `crop_at`."""
 WIDE_F_PX = 100.0
 """Focal length of the whole image that the finder sees, pixels."""
 WIDE_MULTIPLE = 16
@@ -59,71 +60,90 @@ def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:
     )
 
 
-def crop(
-    depth_m: np.ndarray, k: np.ndarray, centre_m: np.ndarray, up: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """What is in the cube about a point.
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_LEAST_SLOPE = np.float32(0.05)
 
-    depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).  centre_m: (3,) in the camera frame.
-    up: see crop_rotation.
-    Returns (CROP_CHANNELS, CROP, CROP) float32, see `channels`, and the crop's rotation (3, 3).
+
+@entry_point
+def crop_at(depth, mirror, k, centre, turn, image):
+    """What is in the cube about a centre (3,), turned by (3, 3), see crop_rotation.
+
+    depth: (H, W) float32 rectified Z in metres, 0 = no reading.  mirror: it is read as a mirror
+    shows it; k and the centre are those of the mirrored.
+    image: (CROP_CHANNELS, CROP, CROP) float32, written, from the pixels nearest to its samples:
+    mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read); share of readings
+    in the cube; share without a reading; share outside of the image, so that a hand that the border
+    cuts is not taken for a smaller one; the four readings themselves, as the first channel, row by
+    row: a finger is only three cells wide.
     """
-    rotation = crop_rotation(centre_m, up)
-    distance = float(np.linalg.norm(centre_m))
+    mapping, single = np.empty((3, 3), np.float64), np.empty((3, 3), np.float32)
+    slope = np.empty(3, np.float32)
+    distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+    focal, middle = 2 * CROP * distance / CROP_M, (2 * CROP - 1) / 2
+    largest = 0.0
+    for i in range(3):
+        for j in range(3):
+            mapping[i, j] = k[i, 0] * turn[0, j] + k[i, 1] * turn[1, j] + k[i, 2] * turn[2, j]
+        # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
+        mapping[i, 0] /= focal
+        mapping[i, 1] /= focal
+        mapping[i, 2] -= middle * (mapping[i, 0] + mapping[i, 1])
+        for j in range(3):
+            largest = max(largest, abs(mapping[i, j]))
+    for i in range(3):
+        for j in range(3):  # only the ratios count, and a large scale says infinity in float32
+            single[i, j] = mapping[i, j] / largest
+    slope[0], slope[1] = turn[2, 0] / focal, turn[2, 1] / focal
+    slope[2] = turn[2, 2] - middle * (turn[2, 0] + turn[2, 1]) / focal
+    scale, away = np.float32(2 / CROP_M), np.float32(distance)
     samples = 2 * CROP
-    # The crop's pinhole, mapped into the image: u ~ K R K_crop^-1 u_crop.
-    focal = samples * distance / CROP_M
-    middle = (samples - 1) / 2
-    inverse = np.array(
-        [[1 / focal, 0, -middle / focal], [0, 1 / focal, -middle / focal], [0, 0, 1]]
-    )
-    mapping = np.asarray(k, np.float64) @ rotation @ inverse
+    places, share = np.empty(samples, np.int64), np.empty(samples, np.float32)
+    for row in range(CROP):
+        for channel in range(len(image)):  # slices take numba long to compile
+            for column in range(CROP):
+                image[channel, row, column] = _ZERO if channel < 4 else _ONE
+        for line in range(2 * row, 2 * row + 2):
+            _place(depth.shape, mirror, single, slope, np.float32(line), places, share)
+            for sample in range(samples):
+                if places[sample] < 0:
+                    image[3, row, sample // 2] += np.float32(0.25)
+                    continue
+                z = depth.flat[places[sample]] * share[sample]
+                if z > _ZERO:
+                    relative = (z - away) * scale
+                    column = sample // 2
+                    clipped = min(max(relative, -_ONE), _ONE)
+                    image[0, row, column] += clipped
+                    image[4 + 2 * (line - 2 * row) + sample % 2, row, column] = clipped
+                    image[1, row, column] += np.float32(0.25) * (abs(relative) < _ONE)
+                    image[2, row, column] += np.float32(0.25)
+        for column in range(CROP):
+            share_read = image[2, row, column]
+            mean = np.float32(0.25) * image[0, row, column] / max(share_read, np.float32(0.25))
+            image[0, row, column] = mean if share_read > _ZERO else _ONE
+            image[2, row, column] = _ONE - share_read
 
-    def warped(image: np.ndarray) -> np.ndarray:
-        return cv2.warpPerspective(
-            image,
-            mapping,
-            (samples, samples),
-            flags=cv2.INTER_NEAREST | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_CONSTANT,
-            borderValue=0,
-        )
 
-    read = warped(depth_m)
-    # Z of the camera to z of the crop: along a ray d of the crop, z_crop = Z / (R d)_z.
-    steps = (np.arange(samples) - middle) / focal
-    slope = rotation[2, 0] * steps[None, :] + rotation[2, 1] * steps[:, None] + rotation[2, 2]
-    read = np.where(slope > 0.05, read / np.maximum(slope, 0.05), 0).astype(np.float32)
-    inside = (warped(np.ones(depth_m.shape, np.uint8)) > 0) & (slope > 0.05)
-    return channels(read[None], inside[None], np.array([distance], np.float32))[0], rotation
+@compiled
+def _place(shape, flip, mapping, slope, line, places, share):
+    """Of a line's samples: the flat places of their pixels, -1 for none, and z over Z.
 
-
-def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> np.ndarray:
-    """(N, 2 CROP, 2 CROP) readings in crop frames to (N, CROP_CHANNELS, CROP, CROP) float32.
-
-    inside: (N, 2 CROP, 2 CROP) whether a sample lies in the image.
-    distance_m: (N,) of the crops' centres.
-    The channels: mean depth about the centre in half cubes, -1 .. 1 (1 where nothing is read);
-    share of readings in the cube; share without a reading; share outside of the image, so that a
-    hand that the border cuts is not taken for a smaller one; the four readings themselves, as the
-    first channel, row by row: a finger is only three cells wide.
+    mapping: (3, 3) float32 from the crop's samples to pixels.
+    slope: (3,) float32, of a sample: its Z over its z along the crop's axis.
     """
-    n = len(read_m)
-    blocks = np.ascontiguousarray(read_m).reshape(n, CROP, 2, CROP, 2)
-    valid = blocks > 0
-    relative = (blocks - distance_m[:, None, None, None, None]) * np.float32(2 / CROP_M)
-    near = valid & (np.abs(relative) < 1)
-    count = valid.sum((2, 4), dtype=np.float32)
-    total = np.where(valid, relative.clip(-1, 1), 0).sum((2, 4), dtype=np.float32)
-    out = np.empty((n, CROP_CHANNELS, CROP, CROP), np.float32)
-    out[:, 0] = np.where(count > 0, total / np.maximum(count, 1), 1.0)
-    out[:, 1] = near.sum((2, 4), dtype=np.float32) * np.float32(0.25)
-    out[:, 2] = 1 - count * np.float32(0.25)
-    within = inside.reshape(blocks.shape).sum((2, 4), dtype=np.float32)
-    out[:, 3] = 1 - within * np.float32(0.25)
-    each = np.where(valid, relative.clip(-1, 1), np.float32(1))
-    out[:, 4:] = each.transpose(0, 2, 4, 1, 3).reshape(n, 4, CROP, CROP)
-    return out
+    height, width = np.float32(shape[0]), np.float32(shape[1])
+    for sample in range(len(places)):  # vectorised
+        a = np.float32(sample)
+        w = _ONE / (mapping[2, 0] * a + mapping[2, 1] * line + mapping[2, 2])
+        u = np.floor((mapping[0, 0] * a + mapping[0, 1] * line + mapping[0, 2]) * w + _HALF)
+        v = np.floor((mapping[1, 0] * a + mapping[1, 1] * line + mapping[1, 2]) * w + _HALF)
+        s = slope[0] * a + slope[1] * line + slope[2]
+        seen = (w > _ZERO) & (s > _LEAST_SLOPE)
+        seen = seen & (u >= _ZERO) & (u < width) & (v >= _ZERO) & (v < height)
+        column = width - _ONE - u if flip else u
+        place = np.int64(v if seen else _ZERO) * shape[1] + np.int64(column if seen else _ZERO)
+        places[sample] = place if seen else -1
+        share[sample] = _ONE / s
 
 
 def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:

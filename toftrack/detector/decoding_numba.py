@@ -1,4 +1,4 @@
-"""What the pose network says of a crop, in compiled code; see PoseNet.decode and proposals."""
+"""What the pose network says of a crop, in compiled code; see PoseNet.decode, the reference."""
 
 from __future__ import annotations
 
@@ -24,9 +24,10 @@ from toftrack.detector.network import (
     SIGMA_M,
     cube_rotations,
 )
-from toftrack.detector.proposals import KEPT
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
+KEPT = 12
+"""Hypotheses of a crop that are used further."""
 _ANCHORS = cube_rotations().double().numpy()
 _LIMITS = np.array(ANGLE_LIMITS)
 _PIVOT = np.array(PIVOT_M)
@@ -34,12 +35,12 @@ _PIVOT = np.array(PIVOT_M)
 
 @entry_point
 def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
-    """What the network's outputs for a crop mean, see PoseNet.decode and proposals.
+    """What the network's outputs for a crop mean, see PoseNet.decode.
 
     heads: (REPORTED,).  keypoints: (5 * JOINTS, CELLS, CELLS).  depth: (CROP, CROP), the first
     channel.  turn, centre, mirror: as of crop_at.
     hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
-    c, out: the row to write in the arrays of `_empty`.
+    c, out: the row to write in the arrays of proposals._SHAPES.
     """
     joints, sigma, present, right = out[7:]
     present[c], right[c] = heads[len(_ANCHORS) * EACH], heads[len(_ANCHORS) * EACH + 1]
@@ -84,7 +85,7 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
         x, y, z = one[7 + ANGLES], one[8 + ANGLES], one[9 + ANGLES]
         at = (OFFSET_M * x, OFFSET_M * y, OFFSET_M * z)
         _into_camera(at, turn, centre, mirror, pivot[c, kept])
-        error[c, kept] = ERROR_M * softplus(one[EACH - 1]) + LEAST_ERROR_M
+        error[c, kept] = ERROR_M * _softplus(one[EACH - 1]) + LEAST_ERROR_M
         pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
         size = math.exp(log_size[c, kept])
         for i in range(3):
@@ -159,7 +160,7 @@ def _decode_keypoints(keypoints, depth, joints, sigma):
                 d += weight * (surface + JOINT_M * z[row, column])
                 spread += weight * deviation[row, column]
         joints[j, 0], joints[j, 1], joints[j, 2] = a / total, b / total, d / total
-        sigma[j] = SIGMA_M * softplus(spread / total) + LEAST_SIGMA_M
+        sigma[j] = SIGMA_M * _softplus(spread / total) + LEAST_SIGMA_M
 
 
 @compiled
@@ -169,6 +170,6 @@ def _cell(number):
 
 
 @compiled
-def softplus(x):
+def _softplus(x):
     """Of a number: log(1 + exp(x))."""
     return x + math.log1p(math.exp(-x)) if x > 0 else math.log1p(math.exp(x))

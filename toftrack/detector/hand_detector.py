@@ -16,8 +16,13 @@ from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.parts import ALL_HAND, Parts
-from toftrack.detector.proposals import NetworkOutput, Places, start_finding
-from toftrack.detector.proposals_numba import run_pose_network, start_pose_network
+from toftrack.detector.proposals import (
+    NetworkOutput,
+    Places,
+    run_pose_network,
+    start_finding,
+    start_pose_network,
+)
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints

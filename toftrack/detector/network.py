@@ -12,12 +12,13 @@ from __future__ import annotations
 import itertools
 from typing import NamedTuple
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from toftrack.compute.rotations import special_gramschmidt
-from toftrack.compute.transfer import table
+from toftrack.compute.transfer import on_device, on_host, table
 from toftrack.detector.crops import CROP_CHANNELS, CROP_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
@@ -163,6 +164,14 @@ class PoseNet(nn.Module):
         merged = merged + _twice_as_fine(self.lateral_8(middle))
         merged = self.smooth(F.relu(merged))
         return self.heads(dense), self.keypoints(merged), self.painted(merged)
+
+    @torch.inference_mode()
+    def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """`features` of crops, as arrays on the CPU."""
+        image = torch.from_numpy(crops).to(memory_format=torch.channels_last)
+        found = on_host(*self.features(on_device(image, self.device)))
+        heads, keypoints, parts = (one.contiguous().numpy() for one in found)
+        return heads, keypoints, parts
 
     def decode(self, image: Tensor, heads: Tensor, keypoints: Tensor, painted: Tensor) -> Proposed:
         """What the outputs of `features` mean; in full precision."""

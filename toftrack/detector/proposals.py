@@ -1,40 +1,35 @@
 """From depth images to hypotheses: where hands may be, and what poses they may have there.
 
-The networks know right hands. For a left one the image is mirrored before, and what was found is
-mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they are.
+The networks know right hands. For a left one the image is read as a mirror shows it, and what was
+found is mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they are.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import lru_cache, partial
 
 import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from toftrack.compute.rigid import PIVOT_M
-from toftrack.compute.rotations import rotmat_to_rotvec
-from toftrack.compute.threads import beside
+from toftrack.compute.threads import beside, run_shared
 from toftrack.compute.transfer import on_device, on_host
-from toftrack.detector.crops import crop, wide
-from toftrack.detector.network import STRIDE, Finder, Found, PoseNet, Proposed
-from toftrack.detector.onnx_networks import OnnxFinder
-from toftrack.detector.parts import Parts
-from toftrack.hand.shape import HandShape, default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
+from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_at, crop_rotation, wide
+from toftrack.detector.decoding_numba import KEPT, decode_at
+from toftrack.detector.network import ANGLES, JOINTS, PARTS, STRIDE, Finder, Found, PoseNet
+from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet
+from toftrack.detector.parts import Parts, likeliest_parts
+from toftrack.hand.shape import default_hand_shape
 
 SAME_PLACE_M = 0.06
 """Hands that are detected closer together are one."""
 _ONE_PALM_M = 0.035
 """Places of the finder that lie closer together are one palm. It is less than the above, since the
 finder takes hands that touch for nearer than they are: 4 cm apart where it was 9."""
-KEPT = 12
-"""Hypotheses of a crop that are used further."""
-MIRROR = torch.tensor([-1.0, 1.0, 1.0])
-MIRROR_TURN = torch.tensor([1.0, -1.0, -1.0])
+_MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,44 +70,27 @@ class NetworkOutput:
     parts: tuple[Parts, ...]
 
 
-def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The image as a mirror shows it, and its intrinsics."""
-    k = k.copy()
-    k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
-    return np.ascontiguousarray(depth_m[:, ::-1]), k
-
-
-@torch.inference_mode()
-def find_hands(
-    finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
-) -> Places:
-    """Where hands of either side may be: at most `most` places, at least `least` likely.
-
-    depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
-    """
-    image, wide_k = wide(depth_m, k)
-    found = Found(*on_host(*finder(on_device(image, finder.device))))
-    return _places(found, wide_k, most, least)
-
-
 def start_finding(
     finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
 ) -> Callable[[], Places]:
-    """The same, begun in another thread if there may be one; what is returned waits for it."""
-    if not isinstance(finder, OnnxFinder):
-        return partial(find_hands, finder, depth_m, k, most, least)
+    """Where hands of either side may be: at most `most` places, at least `least` likely.
 
+    depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
+    Begun in another thread if there may be one; what is returned waits for it.
+    """
+
+    @torch.inference_mode()
     def look() -> tuple[Found, np.ndarray]:
         image, wide_k = wide(depth_m, k)
-        return finder(image), wide_k
+        return Found(*on_host(*finder(on_device(image, finder.device)))), wide_k
 
-    wait = beside(look)
+    wait = beside(look) if isinstance(finder, OnnxFinder) else look
     return lambda: _places(*wait(), most, least)
 
 
 @torch.inference_mode()
 def _places(found: Found, wide_k: np.ndarray, most: int, least: float) -> Places:
-    """See find_hands; wide_k: (3, 3) of the image that the finder has seen."""
+    """See start_finding; wide_k: (3, 3) of the image that the finder has seen."""
     heat = found.heat.sigmoid()
     peaks = (heat == F.max_pool2d(heat, 3, 1, 1)) & (heat >= least)
     row, column = peaks[0].nonzero().unbind(1)
@@ -139,9 +117,24 @@ def _apart(centres_m: np.ndarray, most: int) -> list[int]:
     return kept
 
 
-@torch.inference_mode()
+_SHAPES = {
+    "pivot_m": (KEPT, 3),
+    "rotvec": (KEPT, 3),
+    "angles": (KEPT, ANGLES),
+    "log_size": (KEPT,),
+    "log_probability": (KEPT,),
+    "error_m": (KEPT,),
+    "joints_m": (KEPT, JOINTS, 3),
+    "keypoints_m": (JOINTS, 3),
+    "sigma_m": (JOINTS,),
+    "present": (),
+    "right": (),
+}
+"""Of a crop: the numbers of a NetworkOutput, as the compiled code writes them."""
+
+
 def run_pose_network(
-    pose: PoseNet,
+    pose: PoseNet | OnnxPoseNet,
     depth_m: np.ndarray,
     k: np.ndarray,
     centres_m: np.ndarray,
@@ -154,64 +147,104 @@ def run_pose_network(
     crops.crop_rotation; None: crops as the camera is held. A network that learns hands that are
     upright, more or less, knows them better.
     """
-    centres_m = np.asarray(centres_m, np.float64).reshape(-1, 3)
-    ups = [None] * len(centres_m) if up is None else list(np.asarray(up, np.float64))
-    if side == "left":
-        depth_m, k = mirrored(depth_m, k)
-        centres_m = centres_m * MIRROR.numpy()
-        ups = [None if one is None else one * MIRROR.numpy() for one in ups]
-    crops, crop_rotations = zip(
-        *(crop(depth_m, k, *at) for at in zip(centres_m, ups, strict=True)), strict=True
-    )
-    image = torch.from_numpy(np.stack(crops))
-    image = image.to(memory_format=torch.channels_last)
-    p = Proposed(*on_host(*pose(on_device(image, pose.device))))
-    turn = torch.from_numpy(np.stack(crop_rotations)).float()  # (C, 3, 3)
-    centre = torch.from_numpy(centres_m).float()
-    order = p.log_probability.argsort(1, descending=True)[:, :KEPT]
-
-    def ordered(values: Tensor) -> Tensor:
-        return values[torch.arange(len(order))[:, None], order]
-
-    pivot = ordered(p.pivot_m) @ turn.mT + centre[:, None]
-    rotvec = rotmat_to_rotvec(turn[:, None] @ ordered(p.rotation))
-    keypoints = p.joints_m @ turn.mT + centre[:, None]
-    if side == "left":
-        pivot, keypoints, rotvec = pivot * MIRROR, keypoints * MIRROR, rotvec * MIRROR_TURN
-    angles, log_size = ordered(p.angles), ordered(p.log_size)
-    return NetworkOutput(
-        pivot_m=pivot,
-        rotvec=rotvec,
-        angles=angles,
-        log_size=log_size,
-        log_probability=ordered(p.log_probability),
-        error_m=ordered(p.error_m),
-        joints_m=_joints(pivot, rotvec, angles, log_size, side),
-        keypoints_m=keypoints,
-        sigma_m=p.sigma_m,
-        present=p.present,
-        right=p.right,
-        parts=tuple(
-            Parts(kind, rotation, centre_m, side == "left")
-            for kind, rotation, centre_m in zip(
-                p.parts.argmax(1).byte().numpy(), crop_rotations, centres_m, strict=True
-            )
-        ),
-    )
+    crops = _Crops(pose, depth_m, k, centres_m, side, up)
+    rows = iter(range(len(crops.centres)))
+    run_shared(lambda: crops.propose(rows), len(crops.centres) if _may_be_shared(pose) else 1)
+    return crops.reported()
 
 
-def _joints(pivot_m: Tensor, rotvec: Tensor, angles: Tensor, log_size: Tensor, side: str) -> Tensor:
-    """(C, H, 21, 3) of mean hands scaled about the middle of the palm."""
-    flat = rotvec.flatten(0, 1), angles.flatten(0, 1)
-    states = torch.cat((torch.zeros_like(flat[0]), *flat), 1)
-    pose = forward_kinematics(states, mean_hand(side))
-    # A mirror changes nothing on the palm's middle line.
-    middle = pose.frames[:, 0] @ rotvec.new_tensor(PIVOT_M)
-    joints = (pose.joints_m - middle[:, None]).unflatten(0, log_size.shape)
-    return pivot_m[:, :, None] + joints * log_size.exp()[..., None, None]
+def start_pose_network(
+    pose: PoseNet | OnnxPoseNet,
+    depth_m: np.ndarray,
+    k: np.ndarray,
+    centre_m: np.ndarray,
+    side: str,
+    up: np.ndarray | None = None,
+) -> Callable[[], NetworkOutput]:
+    """The same at one place (3,), `up` (3,), begun in another thread if there may be one; what is
+    returned waits for it.
+
+    That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
+    """
+    given = pose, depth_m, k, centre_m[None], side, None if up is None else up[None]
+    if isinstance(pose, PoseNet) or not _may_be_shared(pose):
+        return functools.partial(run_pose_network, *given)
+    crops = _Crops(*given)
+    image = crops.image(0)
+    wait = beside(functools.partial(pose.outputs, image))
+
+    def reported() -> NetworkOutput:
+        crops.decode(0, image, wait())
+        return crops.reported()
+
+    return reported
 
 
-@lru_cache
-def mean_hand(side: str) -> HandShape:
-    """The mean adult's of a side."""
-    return default_hand_shape(side=side)
+def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
+    """Whether other threads may compute: torch has threads of its own, and needs the lock."""
+    return isinstance(pose, OnnxPoseNet) and decode_at.is_compiled
+
+
+class _Crops:
+    """Crops, and what is found in them, in arrays of _SHAPES and of the parts' kinds, which are
+    written row by row.
+    """
+
+    def __init__(
+        self,
+        pose: PoseNet | OnnxPoseNet,
+        depth_m: np.ndarray,
+        k: np.ndarray,
+        centres_m: np.ndarray,
+        side: str,
+        up: np.ndarray | None,
+    ) -> None:
+        self.pose, self.left, self.hand = pose, side == "left", _mean_hand(side)
+        self.depth = np.ascontiguousarray(depth_m, np.float32)
+        # Copies: numba compiles once more for arrays that must not be written to.
+        self.k = np.array(k, np.float64)
+        flip = _MIRROR if self.left else 1.0
+        self.centres = np.array(centres_m, np.float64).reshape(-1, 3) * flip
+        if self.left:  # depth, k and centres are, or are read, as a mirror shows them
+            self.k[0, 2] = depth_m.shape[1] - 1 - self.k[0, 2]
+        count = len(self.centres)
+        ups = [None] * count if up is None else list(np.asarray(up, np.float64) * flip)
+        self.rotations = list(map(crop_rotation, self.centres, ups))
+        self.numbers = tuple(np.empty((count, *one), np.float32) for one in _SHAPES.values())
+        self.kinds = np.empty((count, PARTS, PARTS), np.uint8)
+
+    def propose(self, rows: Iterator[int]) -> None:
+        """Of the next crop as long as there is one, which other threads may have taken.
+
+        Each by itself: a batch takes as long, and what is said of a crop would depend on others.
+        """
+        for row in rows:
+            image = self.image(row)
+            self.decode(row, image, self.pose.outputs(image))
+
+    def image(self, row: int) -> np.ndarray:
+        """(1, CROP_CHANNELS, CROP, CROP)."""
+        image = np.empty((1, CROP_CHANNELS, CROP, CROP), np.float32)
+        crop_at(self.depth, self.left, self.k, self.centres[row], self.rotations[row], image[0])
+        return image
+
+    def decode(self, row: int, image: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
+        """Write what the network's outputs for a crop mean."""
+        heads, keypoints, painted = outputs
+        place = self.rotations[row], self.centres[row], self.left
+        decode_at(heads[0], keypoints[0], image[0, 0], *place, self.hand, row, self.numbers)
+        self.kinds[row] = likeliest_parts(painted[0])
+
+    def reported(self) -> NetworkOutput:
+        """All that was written."""
+        each = zip(self.kinds, self.rotations, self.centres, strict=True)
+        numbers = zip(_SHAPES, map(torch.from_numpy, self.numbers), strict=True)
+        return NetworkOutput(**dict(numbers), parts=tuple(Parts(*one, self.left) for one in each))
+
+
+@functools.cache
+def _mean_hand(side: str) -> tuple[np.ndarray, ...]:
+    """Frames, places and bones of the mean adult's hand of a side."""
+    shape = default_hand_shape(side=side)
+    parts = shape.base_frames, shape.base_m, shape.bone_lengths_m
+    return tuple(part.double().numpy() for part in parts)

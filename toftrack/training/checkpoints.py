@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -38,38 +36,14 @@ _NEWEST = 0.01
 """Weight of a step in the running means."""
 
 
-class RunningMeans:
-    """Means over about the last hundred steps of what they report, kept where that is computed."""
-
-    def __init__(self) -> None:
-        self._names: list[str] = []
-        self._values = torch.zeros(0)
-
-    def add(self, reported: dict[str, Tensor]) -> None:
-        """What a step reports: () tensors. Nobody waits for them."""
-        values = torch.stack(list(reported.values())).detach()
-        if not self._names:
-            self._names, self._values = list(reported), values
-        else:
-            self._values = self._values.to(values.device).lerp(values, _NEWEST)
-
-    def numbers(self) -> dict[str, float]:
-        """The means; waits for the device."""
-        return dict(zip(self._names, self._values.tolist(), strict=True))
-
-    def set(self, numbers: dict[str, float]) -> None:
-        """As they were."""
-        self._names = list(numbers)
-        self._values = torch.tensor(list(numbers.values()), dtype=torch.float32)
-
-
 @dataclass
 class Progress:
     """What changes while a network is trained.
 
     images: that it is to see in all.  step: batches that it has seen.  seconds: that took.
-    recent: running means.
     course: rows of the errors so far.
+    names, recent: means over about the last hundred steps of what they report, kept where that is
+        computed.
     """
 
     network: nn.Module
@@ -78,11 +52,23 @@ class Progress:
     images: int
     step: int = 0
     seconds: float = 0.0
-    recent: RunningMeans = field(default_factory=RunningMeans)
     course: list[dict[str, Any]] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    recent: Tensor = field(default_factory=lambda: torch.zeros(0))
+
+    def add(self, reported: dict[str, Tensor]) -> None:
+        """What a step reports: () tensors. Nobody waits for them."""
+        values = torch.stack(list(reported.values())).detach()
+        if self.names:
+            values = self.recent.to(values.device).lerp(values, _NEWEST)
+        self.names, self.recent = list(reported), values
+
+    def means(self) -> dict[str, float]:
+        """The running means; waits for the device."""
+        return dict(zip(self.names, self.recent.tolist(), strict=True))
 
 
-@dataclass(frozen=True)
+@dataclass
 class Checkpoints:
     """Where a training's checkpoints are.
 
@@ -93,10 +79,7 @@ class Checkpoints:
     folder: Path
     minutes: float
     resume: Path | None = None
-
-    def path(self, name: str, folder: Path | None = None) -> Path:
-        """The file of a network's checkpoint."""
-        return (self.folder if folder is None else folder) / f"{name}{_SUFFIX}"
+    written: float = field(default_factory=time.monotonic)
 
     def restore(self, name: str, progress: Progress, settings: dict[str, Any]) -> None:
         """Bring a network's training to where it was, if it had begun; settings: what it is by.
@@ -104,36 +87,31 @@ class Checkpoints:
         Raises ToftrackError where the folder to resume has no checkpoint, or this one is damaged or
         of another training.
         """
+        self.written = time.monotonic()
         if self.resume is None:
             return
         if not any(self.resume.glob(f"*{_SUFFIX}")):
             raise ToftrackError(
                 f"there is no checkpoint of a training in {self.resume}; train without resume"
             )
-        path = self.path(name, self.resume)
+        path = self.resume / f"{name}{_SUFFIX}"
         if path.exists():
             _restore(path, progress, settings)
 
-    @contextmanager
-    def writing(self, name: str, progress: Progress, settings: dict[str, Any]) -> Iterator[Any]:
-        """Yields what to call after each step: it writes now and then; the end is written too."""
-        last = time.monotonic()
-
-        def stepped() -> None:
-            nonlocal last
-            if time.monotonic() - last > 60 * self.minutes:
-                save(self.path(name), progress, settings)
-                last = time.monotonic()
-
-        yield stepped
-        save(self.path(name), progress, settings)
+    def write(
+        self, name: str, progress: Progress, settings: dict[str, Any], now: bool = False
+    ) -> None:
+        """Write a checkpoint if it is time for one, or now."""
+        if now or time.monotonic() - self.written > 60 * self.minutes:
+            save(self.folder / f"{name}{_SUFFIX}", progress, settings)
+            self.written = time.monotonic()
 
 
 def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
     """Write a checkpoint; an older one there is replaced only by a whole one."""
     content: dict[str, Any] = {name: getattr(progress, name) for name in _NUMBERS}
     content |= {name: getattr(progress, name).state_dict() for name in _STATES}
-    content |= {"settings": settings, "recent": progress.recent.numbers()}
+    content |= {"settings": settings, "recent": progress.means()}
     with whole_file(path) as stream:
         torch.save(content, stream)
 
@@ -153,7 +131,8 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
             getattr(progress, name).load_state_dict(content[name])
         for name in _NUMBERS:
             setattr(progress, name, content[name])
-        progress.recent.set(content["recent"])
+        recent = content["recent"]
+        progress.names, progress.recent = list(recent), torch.tensor(list(recent.values()))
     except _BROKEN as error:
         why = str(error).partition("\n")[0]
         raise ToftrackError(

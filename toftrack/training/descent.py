@@ -15,8 +15,6 @@ checkpoints.py).
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import math
 import sys
 import time
@@ -33,22 +31,12 @@ from toftrack.compute.transfer import on_device
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import checksum
 from toftrack.errors import ToftrackError
-from toftrack.training.batches import (
-    keep_memory,
-    made_batches,
-    makers,
-    mapped,
-    prefetched,
-    tensors_of,
-)
+from toftrack.training.batches import Batches, keep_memory, made_batches, makers, makers_watched
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
 from toftrack.training.images import (
     Crops,
-    CropScenes,
     WideImages,
     crop_images,
-    crop_scenes,
-    crops_on_device,
     wide_images,
 )
 from toftrack.training.losses import finder_loss, pose_losses
@@ -135,7 +123,7 @@ def train_poses(
     """Train the pose network on a device; returns the average of its weights, on the CPU, and the
     course.
 
-    On a CUDA device the pictures are taken there, and each step is a replay of the first one.
+    On a CUDA device each step is a replay of the first one.
     """
     torch.manual_seed(seed)
     network = PoseNet(schedule.width)
@@ -146,9 +134,7 @@ def train_poses(
             outputs = network.features(image)
         return pose_losses(network.decode(image, *outputs), crops, network.anchors)
 
-    task = Task("poses", crop_images, losses)
-    if device.type != "cpu":
-        task = Task("poses", crop_scenes, losses, _taker(device, seed), replayed=True)
+    task = Task("poses", crop_images, losses, replayed=device.type != "cpu")
     return _train(network, task, schedule, shapes, seed, checkpoints, device)
 
 
@@ -185,16 +171,14 @@ def _image(image: Tensor, device: torch.device) -> Tensor:
 class Task:
     """What a network is trained on.
 
-    name: of its checkpoint.  make: what processes make of (batch, shapes, generator).
-    losses: of a batch, and what is reported; () tensors.  taken: what becomes of a batch here.
-    replayed: on a CUDA device, a step is recorded once and replayed, as all its sizes are the same
-    each time.
+    name: of its checkpoint.  make: see Batches.  losses: of a batch, and what is reported; ()
+    tensors.  replayed: a step is recorded once and replayed, on a CUDA device, as all its sizes are
+    the same each time.
     """
 
     name: str
     make: Callable[..., Any]
     losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
-    taken: Callable[[Any], Any] | None = None
     replayed: bool = False
 
     @property
@@ -204,70 +188,44 @@ class Task:
         return f"{network}.{restart and 'restart_'}images"
 
 
-def _taker(device: torch.device, seed: int) -> Callable[[CropScenes], Crops]:
-    """Makes crops of scenes on a CUDA device, beside the training there."""
-    stream: torch.cuda.Stream | None = None
-    seeds = itertools.count(seed + 1)
-
-    def take(scenes: CropScenes) -> Crops:
-        nonlocal stream
-        stream = stream or torch.cuda.Stream(device)
-        with torch.cuda.stream(stream):
-            there = mapped(scenes, lambda one: on_device(one, device))
-            crops = crops_on_device(there, next(seeds))
-        # Whoever trains waits for nothing: these are ready before they are asked for.
-        stream.synchronize()
-        return crops
-
-    return take
-
-
 class _Step:
     """One step of a training: losses, gradients, new weights and their average."""
 
-    def __init__(
-        self,
-        task: Task,
-        network: nn.Module,
-        averaged: nn.Module,
-        optimiser: Muon,
-        device: torch.device,
-    ) -> None:
-        self._task, self._network, self._averaged = task, network, averaged
-        self._optimiser = optimiser
+    def __init__(self, task: Task, progress: Progress, device: torch.device) -> None:
+        self._task, self._progress, self._device = task, progress, device
         self._rate, self._share = torch.zeros((), device=device), torch.ones((), device=device)
-        for group in optimiser.param_groups:
+        for group in progress.optimiser.param_groups:
             group["lr"] = self._rate
         self._graph: Any = None
 
     def __call__(self, batch: Any, rate: float, share: float) -> dict[str, Tensor]:
         """share: of the new weights in the average. Returns what is reported."""
-        if not self._task.replayed:
-            self._rate.fill_(rate)
-            self._share.fill_(share)
-            return self._eager(batch)
-        if self._graph is None:
-            self._record(batch)
+        if self._task.replayed:
+            batch = type(batch)(*(on_device(one, self._device) for one in batch))
+            if self._graph is None:
+                self._record(batch)
         self._rate.fill_(rate)
         self._share.fill_(share)
-        for kept, new in zip(tensors_of(self._batch), tensors_of(batch), strict=True):
-            new.record_stream(torch.cuda.current_stream())
+        if self._graph is None:
+            return self._eager(batch)
+        for kept, new in zip(self._batch, batch, strict=True):
             kept.copy_(new)
         self._graph.replay()
         return self._reported
 
     def _eager(self, batch: Any) -> dict[str, Tensor]:
+        progress = self._progress
         loss, reported = self._task.losses(batch)
-        self._optimiser.zero_grad(set_to_none=True)
+        progress.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(self._network.parameters(), 5.0)
-        self._optimiser.step()
-        _average(self._averaged, self._network, self._share)
+        torch.nn.utils.clip_grad_norm_(progress.network.parameters(), 5.0)
+        progress.optimiser.step()
+        _average(progress.averaged, progress.network, self._share)
         return reported
 
     def _record(self, batch: Any) -> None:
         """As torch.cuda.graph wants it: some steps, here at a rate of 0, then the one to replay."""
-        self._batch = mapped(batch, Tensor.clone)
+        self._batch = type(batch)(*(one.clone() for one in batch))
         self._share.fill_(0)
         stream = torch.cuda.Stream()
         stream.wait_stream(torch.cuda.current_stream())
@@ -330,42 +288,40 @@ def _descend(
     """
     steps = schedule.steps
     network.train().to(device, memory_format=torch.channels_last)
-    begun = deepcopy(network) if start_share > 0 else None
+    begun, averaged = deepcopy(network), deepcopy(network)
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
-    averaged = deepcopy(network)
     progress = Progress(network, averaged, optimiser, schedule.images)
     settings: dict[str, Any] = {"batch": schedule.batch, "rate": schedule.rate}
     settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
-    writing: Any = contextlib.nullcontext(lambda: None)
     if checkpoints is not None:
         checkpoints.restore(task.name, progress, settings)
         _check_length(task.counted, progress, schedule)
-        writing = checkpoints.writing(task.name, progress, settings)
     course = progress.course
     before, began = progress.seconds, time.perf_counter()
+    images = steps * schedule.batch
     done = progress.step * schedule.batch
-    bar = tqdm(
-        total=steps * schedule.batch, initial=done, unit=" images", desc=task.name, file=sys.stderr
-    )
+    bar = tqdm(total=images, initial=done, unit=" images", desc=task.name, file=sys.stderr)
     numbers = range(progress.step, steps)
-    made = made_batches(task.make, schedule.batch, numbers, shapes, seed, makers(device))
-    step = _Step(task, network, averaged, optimiser, device)
-    with bar, writing as stepped, prefetched(made, task.taken) as batches:
-        for batch in batches:
+    batches = Batches(task.make, schedule.batch, shapes, seed)
+    step = _Step(task, progress, device)
+    with bar, makers_watched():
+        for batch in made_batches(batches, numbers, makers(device)):
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
-            progress.recent.add(step(batch, schedule.rate_at(number), share))
+            progress.add(step(batch, schedule.rate_at(number), share))
             bar.update(schedule.batch)
             progress.step = number + 1
             progress.seconds = before + time.perf_counter() - began
             if (number + 1) % 100 == 0 or number + 1 == steps:
-                recent = progress.recent.numbers()
+                recent = progress.means()
                 bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
-                images = (number + 1) * schedule.batch
-                seconds = round(progress.seconds, 1)
-                course.append({"images": images, "seconds": seconds} | recent)
-            stepped()
-    if begun is not None:
+                seen = {"images": (number + 1) * schedule.batch}
+                course.append(seen | {"seconds": round(progress.seconds, 1)} | recent)
+            if checkpoints is not None:
+                checkpoints.write(task.name, progress, settings)
+    if checkpoints is not None:
+        checkpoints.write(task.name, progress, settings, now=True)
+    if start_share > 0:
         _average(averaged, begun, torch.tensor(start_share, device=device))
     network.load_state_dict(averaged.state_dict())
     return course

@@ -53,18 +53,23 @@ def fit_joint_flags(asked: argparse.Namespace) -> None:
     columns = zip(*((part.confidence, part.wrong, part.shown) for part in parts), strict=True)
     tips = Tips(*map(np.concatenate, columns))
     # Both ways round: what halves of few recordings differ by is to be seen.
-    report = [halves(tips, shown, asked.right) for shown in (True, False)]
-    print("\n\nthe other way round\n".join("\n".join(lines(one)) for one in report))
+    reports = [report(tips, shown, asked.right) for shown in (True, False)]
+    print("\n\nthe other way round\n".join(reports))
 
 
-def halves(tips: Tips, shown: bool, right_pct: float) -> dict[str, Any]:
-    """What is chosen on a half, and what it does there and on the one that is shown."""
+def report(tips: Tips, shown: bool, right_pct: float) -> str:
+    """What is chosen on a half, and what it does there and on the one that is shown; the first line
+    goes into conf/lost/calibrated.yaml.
+    """
     least = chosen(tips.half(not shown), right_pct)
-    return {
-        "joint_ok": least,
-        "chosen_on": rates(tips.half(not shown), least),
-        "shown_on": rates(tips.half(shown), least),
-    }
+    lines = [f"joint_ok: {least:g}"]
+    for words, half in (("chosen on", not shown), ("the other half", shown)):
+        of = rates(tips.half(half), least)
+        lines.append(
+            f"{words}: {of['wrong_flagged_pct']} % of {of['wrong']} wrong tips flagged,"
+            f" {of['right_flagged_pct']} % of {of['right']} right ones"
+        )
+    return "\n".join(lines)
 
 
 def recordings(paths: list[str]) -> list[Path]:
@@ -153,15 +158,3 @@ def rates(tips: Tips, least: float) -> dict[str, Any]:
             round(100 * float(flagged[rows].mean()), 1) if rows.any() else None
         )
     return found
-
-
-def lines(report: dict[str, Any]) -> list[str]:
-    """For people; the first goes into conf/lost/calibrated.yaml."""
-    said = [f"joint_ok: {report['joint_ok']:g}"]
-    for where, words in (("chosen_on", "chosen on"), ("shown_on", "the other half")):
-        of = report[where]
-        said.append(
-            f"{words}: {of['wrong_flagged_pct']} % of {of['wrong']} wrong tips flagged,"
-            f" {of['right_flagged_pct']} % of {of['right']} right ones"
-        )
-    return said

@@ -18,8 +18,6 @@ from toftrack.training.things_numba import BALL, BOX, CONE
 
 PIECES = 9
 """Parts of the furniture in an image."""
-
-
 _OFTEN = 2.0, 2.0, 2.0, 2.0, 1.0, 3.0, 3.0
 """How often each kind of furniture stands there, in parts of their sum."""
 
@@ -75,15 +73,14 @@ def _in_row(middle: Tensor, rows: Tensor, axis: int, gap: Tensor, number: int) -
 
 def _bars(middle: Tensor, dice: Dice) -> Tensor:
     """As of a chair's back or a rack, with a board across."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     rows = _standing(n, dice)
     radius, half = dice.uniform(n, low=0.005, high=0.02), dice.uniform(n, low=0.06, high=0.4)
     gap = 2 * radius + dice.uniform(n, low=0.005, high=0.08)
-    sizes = torch.stack((radius, radius, half), 1)
-    across = torch.stack((PIECES / 2 * gap, radius + 0.02, radius), 1)
-    board = make_part(BOX, middle - half[:, None] * rows[:, 1], rows, across, zero, zero)
+    sizes, across = (radius, radius, half), (PIECES / 2 * gap, radius + 0.02, radius)
+    board = make_part(BOX, middle - half[:, None] * rows[:, 1], rows, across)
     bars = [
-        make_part(CONE, _in_row(middle, rows, 0, gap, number), rows, sizes, zero, zero)
+        make_part(CONE, _in_row(middle, rows, 0, gap, number), rows, sizes)
         for number in range(PIECES - 1)
     ]
     return torch.stack((board, *bars), 1)
@@ -91,7 +88,7 @@ def _bars(middle: Tensor, dice: Dice) -> Tensor:
 
 def _boards(middle: Tensor, dice: Dice) -> Tensor:
     """As of a shelf, a table or books."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     rows = _standing(n, dice)
     gap = dice.uniform(n, low=0.03, high=0.3)
     boards = []
@@ -99,51 +96,45 @@ def _boards(middle: Tensor, dice: Dice) -> Tensor:
         half = torch.exp(dice.uniform(n, 3, low=math.log(0.03), high=math.log(0.35)))
         half[:, 1] = dice.uniform(n, low=0.003, high=0.02)
         place = _in_row(middle, rows, 1, gap, number) + 0.05 * dice.normal(n, 3)
-        boards.append(make_part(BOX, place, rows, half, zero, zero))
+        boards.append(make_part(BOX, place, rows, half))
     return torch.stack(boards, 1)
 
 
 def _clutter(middle: Tensor, dice: Dice) -> Tensor:
     """Boxes, cups and balls."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     spread = dice.uniform(n, 1, low=0.05, high=0.35)
     pieces = []
     for number in range(PIECES):
         sizes = 0.036 * torch.exp(0.55 * dice.normal(n, 3).clamp(-2, 2))
         place = middle + spread * torch.tensor([1.0, 0.4, 1.0]) * dice.normal(n, 3)
         kind = (BOX, CONE, BALL)[number % 3]
-        pieces.append(make_part(kind, place, _standing(n, dice), sizes, zero, zero))
+        pieces.append(make_part(kind, place, _standing(n, dice), sizes))
     order = torch.randperm(PIECES, generator=dice.generator)
     return torch.stack(pieces, 1)[:, order]
 
 
 def _leaves(middle: Tensor, dice: Dice) -> Tensor:
     """As of a plant, a fan or cables."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     reach = dice.uniform(n, 1, low=0.03, high=0.15)
     leaves = []
     for _ in range(PIECES):
-        half = torch.stack(
-            (
-                dice.uniform(n, low=0.004, high=0.035),
-                dice.uniform(n, low=0.02, high=0.10),
-                dice.uniform(n, low=0.001, high=0.006),
-            ),
-            1,
-        )
+        wide, long = dice.uniform(n, low=0.004, high=0.035), dice.uniform(n, low=0.02, high=0.10)
+        half = (wide, long, dice.uniform(n, low=0.001, high=0.006))
         place = middle + reach * dice.normal(n, 3)
-        leaves.append(make_part(BOX, place, dice.rotations(n), half, zero, zero))
+        leaves.append(make_part(BOX, place, dice.rotations(n), half))
     return torch.stack(leaves, 1)
 
 
 def _branches(middle: Tensor, dice: Dice) -> Tensor:
     """As of toys, twigs or taps: round limbs from one place in all directions."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     flat = torch.where(dice.chance(0.5, n, 1), 0.3, 1.0)
     thick, long = dice.uniform(n, low=0.004, high=0.018), dice.uniform(n, low=0.03, high=0.14)
     plane = dice.rotations(n)
     core = thick * dice.uniform(n, low=1.0, high=3.0)
-    pieces = [make_part(BALL, middle, plane, torch.stack((core, zero, zero), 1), zero, zero)]
+    pieces = [make_part(BALL, middle, plane, (core, 0 * core, 0 * core))]
     for _ in range(PIECES - 1):
         squeezed = torch.cat((dice.normal(n, 2), flat * dice.normal(n, 1)), 1)
         along = torch.nn.functional.normalize((squeezed[:, None] @ plane)[:, 0], dim=1)
@@ -152,9 +143,9 @@ def _branches(middle: Tensor, dice: Dice) -> Tensor:
         other = dice.rotations(n)[:, 0]
         x = torch.nn.functional.normalize(torch.linalg.cross(along, other), dim=1)
         rows = torch.stack((x, along, torch.linalg.cross(x, along)), 1)
-        sizes = torch.stack((radius, radius * dice.uniform(n, low=0.6, high=1.0), half), 1)
+        sizes = (radius, radius * dice.uniform(n, low=0.6, high=1.0), half)
         place = middle + along * (half + 0.5 * core)[:, None]
-        pieces.append(make_part(CONE, place, rows, sizes, 0.55 * radius, zero))
+        pieces.append(make_part(CONE, place, rows, sizes, 0.55 * radius))
     return torch.stack(pieces, 1)
 
 
@@ -175,7 +166,7 @@ y down, z to its back."""
 
 def _heads(middle: Tensor, dice: Dice) -> Tensor:
     """Heads, mostly upright, that look anywhere."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     lean = torch.tensor([0.2, 0.0, 0.2]) * dice.normal(n, 3)
     yaw = torch.tensor([0.0, 1.0, 0.0]) * dice.uniform(n, 1, low=-math.pi, high=math.pi)
     rows = roma.rotvec_to_rotmat(yaw) @ roma.rotvec_to_rotmat(lean)
@@ -185,13 +176,13 @@ def _heads(middle: Tensor, dice: Dice) -> Tensor:
         at = size * torch.tensor(place) + 0.006 * dice.normal(n, 3)
         sized = size * torch.tensor(sizes) * torch.exp(0.12 * dice.normal(n, 1))
         offset = (at[:, None] @ rows)[:, 0]
-        pieces.append(make_part(kind, middle + offset, rows, sized, zero + 0.8 * edge, zero))
+        pieces.append(make_part(kind, middle + offset, rows, sized, torch.full((n,), 0.8 * edge)))
     return torch.stack(pieces, 1)
 
 
 def frames(middle: Tensor, dice: Dice) -> Tensor:
     """As of a chair's back, a fence or a window: flat slats one way and the other in one plane."""
-    n, zero = len(middle), torch.zeros(len(middle))
+    n = len(middle)
     rows = _standing(n, dice)
     crossed = rows[:, [1, 0, 2]] * torch.tensor([1.0, 1.0, -1.0])[:, None]
     thick = dice.uniform(n, low=0.004, high=0.015)
@@ -199,9 +190,9 @@ def frames(middle: Tensor, dice: Dice) -> Tensor:
     for number in range(PIECES):
         across = number % 2 == 0
         wide = dice.uniform(n, low=0.008, high=0.05)
-        half = torch.stack((wide, dice.uniform(n, low=0.05, high=0.35), thick), 1)
+        half = (wide, dice.uniform(n, low=0.05, high=0.35), thick)
         place = dice.uniform(n, 1, low=-0.25, high=0.25) * rows[:, 1 if across else 0]
         behind = 0.006 * dice.normal(n, 1) * rows[:, 2]
         turned = crossed if across else rows
-        slats.append(make_part(BOX, middle + place + behind, turned, half, zero, zero))
+        slats.append(make_part(BOX, middle + place + behind, turned, half))
     return torch.stack(slats, 1)

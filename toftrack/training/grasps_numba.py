@@ -76,96 +76,92 @@ def _to_capsules(capsules, x, y, z):
 
 
 @compiled
-def _capsules_of(finger, angles, base_frames, base, lengths, radii, shifts, capsules):
-    """A finger's three bones into capsules (3, _CAPSULE)."""
-    frame = base_frames[finger].copy()
-    x, y, z = base[finger, 0], base[finger, 1], base[finger, 2]
-    angle = 1 + 4 * finger
-    for bone in range(3):
-        for column in range(0 if bone == 0 else 1, 2):
-            mix_columns(frame, column, angles[angle])
-            angle += 1
-        length, shift = lengths[finger, bone], shifts[finger, bone]
-        end = length - radii[finger, bone] if bone == 2 else length
-        for k, along in enumerate((0.0, end)):
-            capsules[bone, 3 * k] = x - along * frame[0, 1] - shift * frame[0, 2]
-            capsules[bone, 3 * k + 1] = y - along * frame[1, 1] - shift * frame[1, 2]
-            capsules[bone, 3 * k + 2] = z - along * frame[2, 1] - shift * frame[2, 2]
-        capsules[bone, 6] = radii[finger, bone]
-        x -= length * frame[0, 1]
-        y -= length * frame[1, 1]
-        z -= length * frame[2, 1]
-
-
-@compiled
-def _gap(finger, first, angles, base_frames, base, lengths, radii, shifts, parts, frame, others):
-    """How far the bones of a finger, from number `first` on, are from the thing, and from the
-    capsules of other fingers (N, _CAPSULE).
+def _walk(finger, angles, hand):
+    """Of a finger's bones, into the last of `hand`: where they begin, their axes y, against which
+    they point, and z, away from the palm.
     """
-    start = 0 if finger == 0 else 1 + 4 * finger
+    (base_frames, base, lengths, _, _), _, _, (frame, at) = hand
     for i in range(3):
         for j in range(3):
             frame[i, j] = base_frames[finger, i, j]
     x, y, z = base[finger, 0], base[finger, 1], base[finger, 2]
-    angle = start
-    gap = 1.0
+    angle = 0 if finger == 0 else 1 + 4 * finger
     for bone in range(3):
         for column in range(0 if bone == 0 or (bone == 1 and finger == 0) else 1, 2):
             mix_columns(frame, column, angles[angle])
             angle += 1
-        length, radius = lengths[finger, bone], radii[finger, bone]
-        shift = shifts[finger, bone]
-        if bone >= first:
-            end = length - radius if bone == 2 else length
-            for sample in range(4):
-                along = end * (0.16 + 0.28 * sample)
-                px = x - along * frame[0, 1] - shift * frame[0, 2]
-                py = y - along * frame[1, 1] - shift * frame[1, 2]
-                pz = z - along * frame[2, 1] - shift * frame[2, 2]
-                gap = min(gap, _thing_distance(parts, px, py, pz) - radius)
-                if len(others) > 0:
-                    gap = min(gap, _to_capsules(others, px, py, pz) - radius + _PRESSED_M)
+        at[bone, 0, 0], at[bone, 0, 1], at[bone, 0, 2] = x, y, z
+        for i in range(3):
+            at[bone, 1, i], at[bone, 2, i] = frame[i, 1], frame[i, 2]
+        length = lengths[finger, bone]
         x -= length * frame[0, 1]
         y -= length * frame[1, 1]
         z -= length * frame[2, 1]
+
+
+@compiled
+def _inside(bone, along, shift):
+    """A point of a bone, see _walk, that lies palmward of its axis."""
+    return (
+        bone[0, 0] - along * bone[1, 0] - shift * bone[2, 0],
+        bone[0, 1] - along * bone[1, 1] - shift * bone[2, 1],
+        bone[0, 2] - along * bone[1, 2] - shift * bone[2, 2],
+    )
+
+
+@compiled
+def _capsules_of(finger, angles, hand, capsules):
+    """A finger's three bones into capsules (3, _CAPSULE)."""
+    _walk(finger, angles, hand)
+    (_, _, lengths, radii, shifts), _, _, (_, at) = hand
+    for bone in range(3):
+        length, shift = lengths[finger, bone], shifts[finger, bone]
+        end = length - radii[finger, bone] if bone == 2 else length
+        for k, along in enumerate((0.0, end)):
+            x, y, z = _inside(at[bone], along, shift)
+            capsules[bone, 3 * k], capsules[bone, 3 * k + 1], capsules[bone, 3 * k + 2] = x, y, z
+        capsules[bone, 6] = radii[finger, bone]
+
+
+@compiled
+def _gap(finger, first, angles, hand):
+    """How far the bones of a finger, from number `first` on, are from the thing, and from the
+    capsules of other fingers (N, _CAPSULE).
+    """
+    _walk(finger, angles, hand)
+    (_, _, lengths, radii, shifts), parts, others, (_, at) = hand
+    gap = 1.0
+    for bone in range(first, 3):
+        length, radius = lengths[finger, bone], radii[finger, bone]
+        end = length - radius if bone == 2 else length
+        for sample in range(4):
+            x, y, z = _inside(at[bone], end * (0.16 + 0.28 * sample), shifts[finger, bone])
+            gap = min(gap, _thing_distance(parts, x, y, z) - radius)
+            if len(others) > 0:
+                gap = min(gap, _to_capsules(others, x, y, z) - radius + _PRESSED_M)
     return gap
 
 
 @compiled
-def _opposition(angles, base_frames, base, lengths, radii, shifts, parts, frame):
+def _opposition(angles, hand):
     """How far before the palm the thumb's tip is, less half of how far it is beside the middle
     between index and middle finger, metres; -1 where its pad does not touch the thing.
     """
-    for i in range(3):
-        for j in range(3):
-            frame[i, j] = base_frames[0, i, j]
-    x, y, z = base[0, 0], base[0, 1], base[0, 2]
-    angle = 0
-    for bone in range(3):
-        for column in range(0 if bone < 2 else 1, 2):
-            mix_columns(frame, column, angles[angle])
-            angle += 1
-        length, shift = lengths[0, bone], shifts[0, bone]
-        if bone < 2:
-            x, y, z = x - length * frame[0, 1], y - length * frame[1, 1], z - length * frame[2, 1]
-    radius = radii[0, 2]
+    _walk(0, angles, hand)
+    (_, base, lengths, radii, shifts), parts, _, (_, at) = hand
+    last, length, radius = at[2], lengths[0, 2], radii[0, 2]
     nearest, way = 1.0, 0.0
     for sample in range(4):
-        along = (length - radius) * (0.16 + 0.28 * sample)
-        px = x - along * frame[0, 1] - shift * frame[0, 2]
-        py = y - along * frame[1, 1] - shift * frame[1, 2]
-        pz = z - along * frame[2, 1] - shift * frame[2, 2]
-        gap = _thing_distance(parts, px, py, pz)
+        x, y, z = _inside(last, (length - radius) * (0.16 + 0.28 * sample), shifts[0, 2])
+        gap = _thing_distance(parts, x, y, z)
         if gap < nearest:
-            step = _PAD_M
-            onward = _thing_distance(
-                parts, px - step * frame[0, 2], py - step * frame[1, 2], pz - step * frame[2, 2]
-            )
-            nearest, way = gap, (gap - onward) / step
+            dx, dy, dz = _PAD_M * last[2, 0], _PAD_M * last[2, 1], _PAD_M * last[2, 2]
+            onward = _thing_distance(parts, x - dx, y - dy, z - dz)
+            nearest, way = gap, (gap - onward) / _PAD_M
     if nearest - radius > _TOUCH_M or way < _FACING:
         return -1.0
-    beside = x - length * frame[0, 1] - 0.5 * (base[1, 0] + base[2, 0])
-    return length * frame[2, 1] - z - 0.5 * abs(beside)
+    beside = last[0, 0] - length * last[1, 0] - 0.5 * (base[1, 0] + base[2, 0])
+    return length * last[1, 2] - last[0, 2] - 0.5 * abs(beside)
 
 
 @compiled
@@ -178,17 +174,17 @@ def _bending(finger, bone):
 
 @compiled
 def _close(finger, most, angles, hand):
-    """Bend a finger about the thing; hand: what _gap needs besides."""
+    """Bend a finger about the thing."""
     for bone in range(3):
         angle = _bending(finger, bone)
         free = angles[angle]
         while True:
             angles[angle] = min(free + _STEP, most[angle])
-            if _gap(finger, bone, angles, *hand) < 0:
+            if _gap(finger, bone, angles, hand) < 0:
                 meets = angles[angle]
                 for _ in range(_HALVINGS):
                     angles[angle] = 0.5 * (free + meets)
-                    if _gap(finger, bone, angles, *hand) < 0:
+                    if _gap(finger, bone, angles, hand) < 0:
                         meets = angles[angle]
                     else:
                         free = angles[angle]
@@ -201,9 +197,9 @@ def _close(finger, most, angles, hand):
 
 @compiled
 def _yield(finger, angles, hand):
-    """Stretch a finger until it is not in the thing; hand: what _gap needs besides."""
+    """Stretch a finger until it is not in the thing."""
     for _ in range(14):
-        if _gap(finger, 0, angles, *hand) >= 0:
+        if _gap(finger, 0, angles, hand) >= 0:
             break
         if finger == 0:  # away from the palm first, then straight; as long as it can, opposed
             if angles[0] < _WIDEST:
@@ -219,22 +215,7 @@ def _yield(finger, angles, hand):
 
 
 @entry_point
-def grasp(
-    angles,
-    thumbs,
-    opposed,
-    most,
-    tasks,
-    in_palm,
-    flesh,
-    base_frames,
-    base,
-    lengths,
-    radii,
-    shifts,
-    parts,
-    said,
-):
+def grasp(angles, thumbs, opposed, most, tasks, in_palm, flesh, bones, parts, said):
     """N hands on N things.
 
     angles: (N, 21), bent in place.  thumbs: (N, K, 5) where the thumbs of power grasps begin, tried
@@ -242,15 +223,16 @@ def grasp(
     first one whose pad touches the thing.  most: (N, 21) beyond which nothing bends.
     tasks: (N, 5) CLOSE or YIELD.  in_palm: (N,) the thing is to touch the palm; its parts
     (N, Q, PART) are moved.  flesh: (N,) how thick the palm is before its bones.
-    base_frames (N, 5, 3, 3), base (N, 5, 3), lengths (N, 5, 3): of HandShape.
-    radii, shifts: (N, 5, 3) of the bones' capsules, and how far palmward they lie.
+    bones: frames (N, 5, 3, 3), places (N, 5, 3) and lengths (N, 5, 3) of HandShape; radii of
+    capsules, and how far palmward they lie (N, 5, 3).
     said: (N, 2) fingers that touch, and the deepest that any lies in the thing, metres.
     """
-    frame, thumb, none = np.empty((3, 3)), np.empty(5), np.empty((0, _CAPSULE))
-    before = np.empty((_BEFORE_THUMB, _CAPSULE))
+    thumb, none = np.empty(5), np.empty((0, _CAPSULE))
+    before, work = np.empty((_BEFORE_THUMB, _CAPSULE)), (np.empty((3, 3)), np.empty((3, 3, 3)))
+    base_frames, base, lengths, radii, shifts = bones
     for n in range(len(angles)):
-        bones = (base_frames[n], base[n], lengths[n], radii[n], shifts[n])
-        hand = (*bones, parts[n], frame, none)
+        mine = base_frames[n], base[n], lengths[n], radii[n], shifts[n]
+        hand = (mine, parts[n], none, work)  # what _walk, _gap and others are about
         if in_palm[n]:
             _place_in_palm(parts[n], base[n], flesh[n])
         for finger in (1, 2, 3, 4):
@@ -260,14 +242,14 @@ def grasp(
         # The thumb last: the fingers hold the thing already.
         if in_palm[n]:
             for finger in (1, 2, 3):
-                _capsules_of(finger, angles[n], *bones, before[3 * (finger - 1) : 3 * finger])
-            about = (*bones, parts[n], frame, before)
+                _capsules_of(finger, angles[n], hand, before[3 * (finger - 1) : 3 * finger])
+            about = (mine, parts[n], before, work)
             best = -2.0
             for start in range(thumbs.shape[1]):
                 angles[n, :5] = thumbs[n, start]
                 _yield(0, angles[n], about)
                 _close(0, most[n], angles[n], about)
-                opposition = _opposition(angles[n], *bones, parts[n], frame)
+                opposition = _opposition(angles[n], hand)
                 if opposition > best:
                     best = opposition
                     thumb[:] = angles[n, :5]
@@ -280,7 +262,7 @@ def grasp(
                 _close(0, most[n], angles[n], hand)
         touching, deepest = 0, 0.0
         for finger in range(5):
-            gap = _gap(finger, 0, angles[n], *hand)
+            gap = _gap(finger, 0, angles[n], hand)
             touching += gap < _TOUCH_M
             deepest = max(deepest, -gap)
         said[n, 0], said[n, 1] = touching, deepest

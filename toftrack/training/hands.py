@@ -28,7 +28,7 @@ from toftrack.training.held_things import (
     things_between_tips,
     things_in_palms,
 )
-from toftrack.training.shapes import ShapeBank, cupped
+from toftrack.training.shapes import ShapeBank, cupped, rows_of
 from toftrack.training.shown_poses import shown_poses
 from toftrack.training.skin import Skins, random_skins
 from toftrack.training.things_numba import PART
@@ -156,7 +156,7 @@ def posed_hands(
     parts = torch.zeros(n, 0, PART)
     free = torch.zeros(n, dtype=torch.bool) if known is None else ~known
     if angles is None or known is not None:
-        own = shown_poses(n, dice.generator)
+        own = shown_poses(n, dice)
         free = torch.ones_like(free) if angles is None else free
         angles = own if angles is None else torch.where(free[:, None], own, angles)
     shape, surface = cupped(shape, surface, angles, bank.log_size[rows], dice)
@@ -218,8 +218,7 @@ def _holding(
     n = len(size)
     angles = angles.clone()
     some = (free & dice.chance(HOLDING, n)).nonzero()[:, 0]
-    shape = HandShape(shape.base_m[some], shape.base_frames[some], shape.bone_lengths_m[some])
-    surface = HandSurface(surface.frame_index, surface.centres_m[some], surface.axes_m[some])
+    shape, surface = rows_of(shape, surface, some)
     parts = torch.zeros(n, PARTS_OF_A_THING, PART)
     parts[..., 0] = -1
     if len(some) > 0:
@@ -313,7 +312,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     n = len(size)
     power = dice.chance(POWER_SHARE, n)
     radii, shifts = _capsules(surface)
-    bare = shown_poses(n, dice.generator)
+    bare = shown_poses(n, dice)
     palm_angles, palm_parts = things_in_palms(size, dice)
     thumbs = open_thumbs(n, _THUMB_TRIES, dice)
     opposed = dice.chance(_OPPOSED_SHARE, n)
@@ -328,6 +327,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     most = clamp_to_joint_limits(torch.deg2rad(most)).double()
     angles, parts = angles.double().contiguous(), parts.double().contiguous()
     flesh = ((0.013 + 0.0015 * dice.normal(n)) * size).double()
+    bones = (shape.base_frames, shape.base_m, shape.bone_lengths_m, radii, shifts)
     grasp(
         angles.numpy(),
         _doubles(thumbs),
@@ -336,9 +336,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
         tasks.contiguous().numpy(),
         power.numpy(),
         flesh.numpy(),
-        *(_doubles(x) for x in (shape.base_frames, shape.base_m, shape.bone_lengths_m)),
-        _doubles(radii),
-        _doubles(shifts),
+        tuple(map(_doubles, bones)),
         parts.numpy(),
         said.numpy(),
     )

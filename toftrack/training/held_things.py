@@ -48,9 +48,18 @@ _PHONE_M = ((0.055, 0.095), (0.115, 0.185), (0.0, 0.016))
 
 
 def make_part(
-    kind: int, place: Tensor, rows: Tensor, sizes: Tensor, edge: Tensor, wall: Tensor
+    kind: int,
+    place: Tensor,
+    rows: Tensor,
+    sizes: Tensor | tuple[Tensor, Tensor, Tensor],
+    edge: Tensor | None = None,
+    wall: Tensor | None = None,
 ) -> Tensor:
-    """(N, PART); place: (N, 3), rows: (N, 3, 3), sizes: (N, 3), edge, wall: (N,)."""
+    """(N, PART); place: (N, 3), rows: (N, 3, 3), sizes: (N, 3) or its columns, edge, wall: (N,),
+    None = 0.
+    """
+    sizes = sizes if isinstance(sizes, Tensor) else torch.stack(sizes, 1)
+    none = torch.zeros(len(place))
     x, y, z = sizes.unbind(1)
     reach = {
         BOX: sizes.norm(dim=1),
@@ -58,9 +67,9 @@ def make_part(
         RING: x + y,
         BALL: x,
     }[kind]
+    rest = (none if edge is None else edge, none if wall is None else wall, reach + 0.001)
     head = torch.full((len(place), 1), float(kind))
-    rest = torch.stack((edge, wall, reach + 0.001), 1)
-    return torch.cat((head, place, rows.flatten(1), sizes, rest), 1)
+    return torch.cat((head, place, rows.flatten(1), sizes, torch.stack(rest, 1)), 1)
 
 
 def _thing(*parts: Tensor) -> Tensor:
@@ -101,74 +110,56 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     edge = between(0.0, 0.004)
     radius, half = between(0.008, 0.042), between(0.035, 0.13)
     taper = 1 + 0.08 * dice.normal(n)
-    cylinder = make_part(
-        CONE, at(half), rows, torch.stack((radius, radius * taper, half), 1), edge, zero
-    )
+    cylinder = make_part(CONE, at(half), rows, (radius, radius * taper, half), edge)
     low, high, tall = between(0.022, 0.038), between(1.0, 1.35), between(0.035, 0.07)
-    wall = between(0.0015, 0.004)
-    cup_sizes = torch.stack((low, low * high, tall), 1)
-    cup = make_part(CONE, at(tall, 0.3 * along * tall), rows, cup_sizes, 0 * edge, wall)
+    wall, middle = between(0.0015, 0.004), at(tall, 0.3 * along * tall)
+    cup = make_part(CONE, middle, rows, (low, low * high, tall), wall=wall)
     ring, thick = between(0.016, 0.028), between(0.0035, 0.007)
     beside = torch.where(dice.chance(0.5, n), 1.0, -1.0)[:, None] * rows[:, 0]
+    beside = beside * (0.5 * low * (1 + high) + 0.6 * ring)[:, None]
     handle_rows = torch.stack((y, rows[:, 0], rows[:, 2]), 1)
-    handle = make_part(
-        RING,
-        at(tall, 0.3 * along * tall) + beside * (0.5 * low * (1 + high) + 0.6 * ring)[:, None],
-        handle_rows,
-        torch.stack((ring, thick, thick), 1),
-        zero,
-        zero,
-    )
+    handle = make_part(RING, middle + beside, handle_rows, (ring, thick, thick))
     body, neck = between(0.022, 0.040), between(0.25, 0.5)
     tall_2, neck_long = between(0.05, 0.10), between(0.02, 0.05)
-    bottle = make_part(
-        CONE, at(tall_2), rows, torch.stack((body, body, tall_2), 1), 0.3 * body, zero
-    )
+    bottle = make_part(CONE, at(tall_2), rows, (body, body, tall_2), 0.3 * body)
     neck_place = at(tall_2) + y * (tall_2 + 0.8 * neck_long)[:, None]
-    neck_sizes = torch.stack((body * neck * 1.3, body * neck, neck_long), 1)
-    neck_part = make_part(CONE, neck_place, rows, neck_sizes, 0 * edge, zero)
+    neck_part = make_part(CONE, neck_place, rows, (body * neck * 1.3, body * neck, neck_long))
     ball_radius = between(0.014, 0.045)
-    ball = make_part(
-        BALL, at(ball_radius, zero), rows, ball_radius[:, None].expand(n, 3), zero, zero
-    )
+    ball = make_part(BALL, at(ball_radius, zero), rows, ball_radius[:, None].expand(n, 3))
     box_sizes = torch.stack((between(0.010, 0.035), between(0.03, 0.10), between(0.008, 0.035)), 1)
-    box = make_part(BOX, at(box_sizes[:, 1]), rows, _no_phone(box_sizes), edge, zero)
+    box = make_part(BOX, at(box_sizes[:, 1]), rows, _no_phone(box_sizes), edge)
     grip, grip_long = between(0.008, 0.017), between(0.045, 0.07)
-    handle_2 = make_part(
-        CONE, at(grip_long, 0 * along), rows, torch.stack((grip, grip, grip_long), 1), edge, zero
-    )
+    grip_place = at(grip_long, 0 * along)
+    handle_2 = make_part(CONE, grip_place, rows, (grip, grip, grip_long), edge)
     shaft_long = between(0.03, 0.09)
-    shaft_place = at(grip_long, 0 * along) + y * (grip_long + shaft_long)[:, None]
+    shaft_place = grip_place + y * (grip_long + shaft_long)[:, None]
     blade = torch.stack((between(0.006, 0.03), shaft_long, between(0.0012, 0.003)), 1)
-    rod = torch.stack((between(0.002, 0.006), between(0.002, 0.006), shaft_long), 1)
+    rod = (between(0.002, 0.006), between(0.002, 0.006), shaft_long)
     tool = torch.where(
         dice.chance(0.5, n)[:, None],
-        make_part(BOX, shaft_place, rows, _no_phone(blade), 0 * edge, zero),
-        make_part(CONE, shaft_place, rows, rod, 0 * edge, zero),
+        make_part(BOX, shaft_place, rows, _no_phone(blade)),
+        make_part(CONE, shaft_place, rows, rod),
     )
     # None is as thin as a hammer's handle.
     oval = torch.stack((between(0.02, 0.042), between(0.02, 0.042), between(0.02, 0.09)), 1)
     block = torch.stack((between(0.02, 0.035), between(0.03, 0.10), between(0.02, 0.035)), 1)
-    grips = (
-        make_part(CONE, at(oval[:, 2]), rows, oval, 0.3 * oval[:, :2].amin(1), zero),
-        make_part(BOX, at(block[:, 1]), rows, block, edge, zero),
-    )
+    grips = [
+        make_part(CONE, at(oval[:, 2]), rows, oval, 0.3 * oval[:, :2].amin(1)),
+        make_part(BOX, at(block[:, 1]), rows, block, edge),
+    ]
     off = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     # Beyond the hand's width along the axis, or before the palm.
     off = off * torch.tensor([0.03, 0.03, 0.0]) + y * (along.sign() * between(0.04, 0.11))[:, None]
     off[:, 2] -= between(0.0, 0.06)
     turned = dice.rotations(n)
     lump = torch.stack((between(0.005, 0.05), between(0.005, 0.06), between(0.003, 0.05)), 1)
-    lumps = (
-        make_part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1), zero),
-        make_part(CONE, place + off, turned, lump, 0.2 * lump.amin(1), zero),
-        make_part(BALL, place + off, turned, lump[:, :1].expand(n, 3), zero, zero),
-        make_part(RING, place + off, turned, 0.5 * lump + 0.005, zero, zero),
-    )
-    odd = _thing(
-        _chosen(list(grips), dice.rows(len(grips), n)),
-        _chosen(list(lumps), dice.rows(len(lumps), n)),
-    )
+    lumps = [
+        make_part(BOX, place + off, turned, _no_phone(lump), 0.2 * lump.amin(1)),
+        make_part(CONE, place + off, turned, lump, 0.2 * lump.amin(1)),
+        make_part(BALL, place + off, turned, lump[:, :1].expand(n, 3)),
+        make_part(RING, place + off, turned, 0.5 * lump + 0.005),
+    ]
+    odd = _chosen(grips, dice.rows(len(grips), n)), _chosen(lumps, dice.rows(len(lumps), n))
     things = {
         "cylinder": _thing(cylinder),
         "cup": _thing(cup),
@@ -177,7 +168,7 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
         "ball": _thing(ball),
         "box": _thing(box),
         "tool": _thing(handle_2, tool),
-        "odd": odd,
+        "odd": _thing(*odd),
     }
     weights = torch.tensor(list(IN_PALM.values()))
     which = torch.multinomial(weights, n, True, generator=dice.generator)
@@ -238,7 +229,6 @@ def things_between_tips(
     def between(low: float, high: float) -> Tensor:
         return dice.uniform(n, low=low, high=high)
 
-    zero = torch.zeros(n)
     away = upright(torch.nn.functional.normalize(middle, dim=1) + 0.35 * dice.normal(n, 3))
     side = torch.linalg.cross(u, away)
     flat = torch.stack((side, away, u), 1)  # rows: thickness along the local z
@@ -247,49 +237,27 @@ def things_between_tips(
     plate_sizes = _no_phone(torch.stack((wide, long, half), 1))
     out = (plate_sizes[:, 1] - between(0.006, 0.025)).clamp(min=0)
     edge = torch.minimum(between(0.0, 0.004), 0.5 * half)
-    plate = make_part(BOX, middle + away * out[:, None], flat, plate_sizes, edge, zero)
+    plate = make_part(BOX, middle + away * out[:, None], flat, plate_sizes, edge)
     disc_radius = between(0.012, 0.075)
-    disc_out = (disc_radius - between(0.006, 0.025)).clamp(min=0)
-    disc = make_part(
-        CONE,
-        middle + away * disc_out[:, None],
-        torch.stack((side, u, -away), 1),
-        torch.stack((disc_radius, disc_radius, half), 1),
-        edge,
-        zero,
-    )
+    disc_place = middle + away * (disc_radius - between(0.006, 0.025)).clamp(min=0)[:, None]
+    disc_rows = torch.stack((side, u, -away), 1)
+    disc = make_part(CONE, disc_place, disc_rows, (disc_radius, disc_radius, half), edge)
     # A pen rests on the web between thumb and index finger.
     pen = upright(shape.base_m[:, 1] + 0.012 * dice.normal(n, 3) - middle)
     pen_rows = torch.stack((torch.linalg.cross(pen, u), pen, u), 1)
     pen_half, pen_out = between(0.055, 0.09), between(0.02, 0.05)
-    pen_sizes = torch.stack((half * between(0.5, 1.0), half, pen_half), 1)
-    pens = make_part(
-        CONE, middle + pen * (pen_half - pen_out)[:, None], pen_rows, pen_sizes, 0 * edge, zero
-    )
-    cube = torch.stack((between(0.006, 0.03), between(0.006, 0.03), half), 1)
-    cubes = make_part(BOX, middle, flat, cube, edge, zero)
-    ball = make_part(BALL, middle, flat, half[:, None].expand(n, 3), zero, zero)
+    pen_place = middle + pen * (pen_half - pen_out)[:, None]
+    pens = make_part(CONE, pen_place, pen_rows, (half * between(0.5, 1.0), half, pen_half))
+    cubes = make_part(BOX, middle, flat, (between(0.006, 0.03), between(0.006, 0.03), half), edge)
+    ball = make_part(BALL, middle, flat, half[:, None].expand(n, 3))
     tall = between(0.012, 0.07)
-    down = torch.stack((side, away, u), 1)
     turned = torch.stack((away, -side, u), 1)
-    standing = torch.where(dice.chance(0.6, n)[:, None, None], turned, down)
+    standing = torch.where(dice.chance(0.6, n)[:, None, None], turned, flat)
     middle_2 = middle + standing[:, 1] * (tall * between(-0.7, 0.7))[:, None]
-    cylinder = make_part(
-        CONE,
-        middle_2,
-        standing,
-        torch.stack((half, half, tall), 1),
-        torch.minimum(edge, 0.3 * half),
-        zero,
-    )
-    cup = make_part(
-        CONE,
-        middle_2,
-        standing,
-        torch.stack((half, half, tall.clamp(min=0.02)), 1),
-        0 * edge,
-        torch.minimum(0.002 + zero, 0.3 * half),
-    )
+    rounded = torch.minimum(edge, 0.3 * half)
+    cylinder = make_part(CONE, middle_2, standing, (half, half, tall), rounded)
+    wall = torch.minimum(torch.full((n,), 0.002), 0.3 * half)
+    cup = make_part(CONE, middle_2, standing, (half, half, tall.clamp(min=0.02)), wall=wall)
     # Which of them, by how thick they are.
     chances = torch.tensor(list(BETWEEN_TIPS.values())).T
     thickness = torch.bucketize(thick, torch.tensor([0.005, 0.015, 0.03]))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -27,8 +28,7 @@ from toftrack.training.hands import (
     random_views,
     turn,
 )
-from toftrack.training.images_numba import read_pictures
-from toftrack.training.pictures import Lens, Shots, random_sensors, shots, take, take_pictures
+from toftrack.training.pictures import Lens, random_sensors, read_pictures, take_pictures
 from toftrack.training.scenes import (
     Scenes,
     background_behind,
@@ -81,15 +81,18 @@ _HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
 
-@dataclass(frozen=True, eq=False)
-class CropHands:
-    """The hands of N crops, in the crop's frame about its centre.
+class Crops(NamedTuple):
+    """N crops, and their hands in the crop's frame about its centre.
 
-    present: (N,) there is a hand near the centre.  right: (N,) and it is a right one.
+    image: (N, CROP_CHANNELS, CROP, CROP).
+    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
+    present: (N,) a hand is seen near the centre.  right: (N,) and it is a right one.
     pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
     joints_m: (N, 21, 3).
     """
 
+    image: Tensor
+    parts: Tensor
     present: Tensor
     right: Tensor
     pivot_m: Tensor
@@ -99,36 +102,7 @@ class CropHands:
     joints_m: Tensor
 
 
-@dataclass(frozen=True, eq=False)
-class Crops(CropHands):
-    """Crops and what is in them; `present`: and it is seen.
-
-    image: (N, CROP_CHANNELS, CROP, CROP).
-    parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
-    """
-
-    image: Tensor
-    parts: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class CropScenes(CropHands):
-    """What crops show, before they are taken; `present`: seen or not.
-
-    shots: the pictures that crops are read of.  side: (N, 2) int32 pixels of such a picture and, in
-    its middle, of the crop.  distance_m: of the crops' centres.  turned: by how much crops are
-    turned, radians.  borders: (N, 2, 3) what lies in the image, see images_numba.
-    """
-
-    shots: Shots
-    side: Tensor
-    distance_m: Tensor
-    turned: Tensor
-    borders: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class WideImages:
+class WideImages(NamedTuple):
     """Whole images and the hands in them: the first is raised, the second another's.
 
     image: (N, 2, *WIDE_SIZE).  cell: (N, 2, 2) column and row of the middle of the palm in cells.
@@ -143,44 +117,6 @@ class WideImages:
 
 def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     """n crops: most about a hand's middle, more or less; some about something else."""
-    return crops_of(crop_scenes(n, bank, generator))
-
-
-def crops_of(scenes: CropScenes) -> Crops:
-    """The crops of scenes on the CPU."""
-    depth, which = take(scenes.shots, (_WHOLE, _WHOLE))
-    image, parts = read_pictures(
-        depth,
-        which,
-        scenes.side.numpy(),
-        scenes.distance_m.numpy(),
-        scenes.turned.numpy(),
-        scenes.borders.numpy(),
-    )
-    return _crops(scenes, torch.from_numpy(image), torch.from_numpy(parts).long())
-
-
-def crops_on_device(scenes: CropScenes, seed: int) -> Crops:
-    """The crops of scenes that are on a CUDA device; seed: of the sensors' noise, with theirs."""
-    from toftrack.training import pictures_triton
-
-    depth, which = pictures_triton.take(scenes.shots, (_WHOLE, _WHOLE), seed)
-    image, parts = pictures_triton.read_pictures(
-        depth, which, scenes.side, scenes.distance_m, scenes.turned, scenes.borders
-    )
-    return _crops(scenes, image, parts)
-
-
-def _crops(scenes: CropScenes, image: Tensor, parts: Tensor) -> Crops:
-    parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
-    parts = torch.where(parts == THING, SEGMENTS - 1, parts)
-    visible = (parts == HAND).sum((1, 2)) >= 12
-    hands = {field.name: getattr(scenes, field.name) for field in fields(CropHands)}
-    return Crops(**hands | {"present": scenes.present & visible}, image=image, parts=parts)
-
-
-def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScenes:
-    """What n crops show, see crop_images."""
     dice = Dice(generator)
     distance = dice.uniform(n, low=math.log(0.27), high=math.log(1.1)).exp()
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
@@ -218,15 +154,17 @@ def crop_scenes(n: int, bank: ShapeBank, generator: torch.Generator) -> CropScen
     whole = (side * (turned.cos().abs() + turned.sin().abs())).ceil()
     middle = (whole - 1) / 2
     lens = Lens(side * distance / CROP_M, middle, middle, whole, whole)
-    to_take = shots(scenes, lens, random_sensors(n, dice), dice)
+    depth, which = take_pictures(scenes, lens, random_sensors(n, dice), (_WHOLE, _WHOLE), dice)
+    sides = torch.stack((whole, side), 1).int()
+    borders = _borders(torch.where(gone, *_CUT), dice)
+    image, parts = read_pictures(depth, which, sides, distance, turned, borders)
+    parts = torch.where(parts == OTHER_HAND, OTHER_FOREARM, parts)
+    parts = torch.where(parts == THING, SEGMENTS - 1, parts)
     back = turn(turned, 2)  # from the crop's frame
-    return CropScenes(
-        shots=to_take,
-        side=torch.stack((whole, side), 1).int(),
-        distance_m=distance,
-        turned=turned,
-        borders=_borders(torch.where(gone, *_CUT), dice),
-        present=present,
+    return Crops(
+        image=image,
+        parts=parts,
+        present=present & ((parts == HAND).sum((1, 2)) >= 12),
         right=~left,
         pivot_m=((pivot - centre)[:, None] @ back)[:, 0],
         rotation=back.mT @ hands.rotation,
@@ -322,20 +260,20 @@ def _with_furniture(scenes: Scenes, centre_m: Tensor, gone: Tensor, dice: Dice) 
     pieces = furniture(there, centre_m + torch.cat((aside, behind), 1), dice)
     onto = centre_m + 0.02 * dice.normal(n, 3) - on_a_piece(pieces, dice)
     pieces[..., 1:4] += torch.where((gone & there)[:, None, None], onto[:, None], 0.0)
-    planes = scenes.planes.clone()
-    without_walls = gone & there & dice.chance(0.7, n)
-    planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
-    return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
+    return _with_pieces(scenes, pieces, gone & there & dice.chance(0.7, n))
 
 
 def furnished(scenes: Scenes, there: Tensor, dice: Dice) -> Scenes:
     """Scenes with furniture, and mostly without walls before it; there: (N,) where there is any."""
-    planes = scenes.planes.clone()
     without_walls = there & dice.chance(0.7, len(there))
+    pieces = furniture(there, before_camera(len(there), dice), dice)
+    return _with_pieces(scenes, pieces, without_walls)
+
+
+def _with_pieces(scenes: Scenes, pieces: Tensor, without_walls: Tensor) -> Scenes:
+    planes = scenes.planes.clone()
     planes[..., 3] = torch.where(without_walls[:, None], torch.inf, planes[..., 3])
-    middle = before_camera(len(there), dice)
-    parts = torch.cat((scenes.parts, furniture(there, middle, dice)), 1)
-    return replace(scenes, planes=planes, parts=parts)
+    return replace(scenes, planes=planes, parts=torch.cat((scenes.parts, pieces), 1))
 
 
 def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
@@ -385,26 +323,25 @@ def random_scenes(
     other: tuple[Hands, Tensor],
     dice: Dice,
     objects: float,
-    views: Tensor | None = None,
+    views: Tensor,
 ) -> Scenes:
     """Everything around a batch of hands.
 
     labels: (N, E) of the hands' ellipsoids.  other: second hands, and where there are any (N,).
     objects: probability of each of two things before or behind a hand.
-    views: (N,) where the cameras are, see scenes; None = before the persons.
+    views: (N,) where the cameras are.
     """
     n = len(labels)
     second, there = other
-    body = surroundings(hands, hands.pivot_m[:, 2], dice, views)
+    body = surroundings(hands, dice, views)
     stuff = things(hands.pivot_m, 2, objects, dice)
     other_labels = torch.where(there[:, None], second.labels, -1)
     centres = (hands.centres_m, second.centres_m, body[0], stuff[0])
     axes = (hands.axes_m, second.axes_m, body[1], stuff[1])
     planes = background_behind((hands.pivot_m[:, 2] + 0.1).clamp(min=0.4), dice)
-    if views is not None:
-        # Whoever looks down sees a table, or the floor far below.
-        planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
-        planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
+    # Whoever looks down sees a table, or the floor far below.
+    planes[..., 3] = torch.where((views == FRONT)[:, None], planes[..., 3], torch.inf)
+    planes = torch.cat((planes, tables_under(hands, views, dice)), 1)
     all_labels = torch.cat((labels, other_labels, body[2], stuff[2]), 1)
     covered = torch.cat((hands.skins.covered, second.skins.covered), 1)
     plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)

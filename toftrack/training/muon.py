@@ -10,7 +10,7 @@ images is where one with AdamW alone would be after about 1.8 times as many: doc
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -43,15 +43,10 @@ class Muon(torch.optim.Optimizer):
         super().__init__(groups, {"lr": rate, "weight_decay": decay})
 
     @torch.no_grad()
-    def step(self, closure: Callable[[], Any] | None = None) -> Any:
-        """One step along the gradients, which `closure` computes anew; returns what that returned.
-
-        Nothing is read back from a GPU, which replays a step as a graph.
+    def step(self, closure: Any = None) -> Any:
+        """One step along the gradients; nothing is read back from a GPU, which replays a step as a
+        graph. closure: torch's optimisers have one, and this one none.
         """
-        loss = None
-        if closure is not None:
-            with torch.enable_grad():
-                loss = closure()
         for group in self.param_groups:
             weights = [weight for weight in group["params"] if weight.grad is not None]
             if weights and not group["inner"]:
@@ -64,7 +59,6 @@ class Muon(torch.optim.Optimizer):
                     along = self._adam(weight, weight.grad, count)
                 weight.mul_(1 - group["lr"] * group["weight_decay"])
                 weight.sub_(group["lr"] * along)
-        return loss
 
     def _inner(self, weight: Tensor, gradient: Tensor) -> Tensor:
         average = self._kept(weight, "exp_avg").lerp_(gradient, 1 - _MOMENTUM)

@@ -95,39 +95,33 @@ def quantised(model: Any, images: np.ndarray) -> Any:
         return onnx.load(file)
 
 
-def compare(pose: PoseNet, model: Any, crops: np.ndarray) -> None:
-    """Raises ToftrackError where a quantised network is too far from torch's on (N, ...) crops."""
+def compare(network: PoseNet | Finder, model: Any, images: np.ndarray) -> None:
+    """Raises ToftrackError where a quantised network is too far from torch's on (N, ...) images."""
     session = open_session(model.SerializeToString())
-    names = ("heads", "keypoints")
-    each = [session.run(names, {"crops": one[None]}) for one in crops]
-    heads, keypoints = (torch.from_numpy(np.concatenate(part)) for part in zip(*each, strict=True))
-    image = torch.from_numpy(crops)
+    name = session.get_inputs()[0].name
+    each = [session.run(None, {name: one[None]}) for one in images]
+    found = [torch.from_numpy(np.concatenate(part)) for part in zip(*each, strict=True)]
+    shown = torch.from_numpy(images)
     with torch.inference_mode():
-        expected, *maps = pose.features(image)
-        joints = pose.decode(image, expected, *maps).joints_m
-        found = pose.decode(image, heads, keypoints, maps[1]).joints_m
-    away = float((found - joints).norm(dim=2).mean())
-    apart = float((heads - expected).square().mean().sqrt() / expected.std())
-    if not (away <= _WITHIN_M and apart <= _SPREAD):
-        raise ToftrackError(
-            f"in 8 bits the network's keypoints are {1e3 * away:.1f} mm away from torch's (at most"
-            f" {1e3 * _WITHIN_M:g}) and its heads {100 * apart:.0f} % of their spread (at most"
-            f" {100 * _SPREAD:g}), so nothing was written; give --float"
-        )
-
-
-def compare_finder(finder: Finder, model: Any, images: np.ndarray) -> None:
-    """Raises ToftrackError where a quantised finder is too far from torch's on (N, ...) images."""
-    session = open_session(model.SerializeToString())
-    each = [session.run(Found._fields, {"images": one[None]}) for one in images]
-    with torch.inference_mode():
-        expected = finder(torch.from_numpy(images))
-    for name, one, *parts in zip(Found._fields, expected, *each, strict=True):
-        found = torch.from_numpy(np.concatenate(parts))
-        apart = float((found - one).square().mean().sqrt() / one.std())
+        if isinstance(network, Finder):
+            expected = dict(
+                zip(Found._fields, zip(found, network(shown), strict=True), strict=True)
+            )
+        else:
+            heads, *maps = network.features(shown)
+            joints = network.decode(shown, heads, *maps).joints_m
+            away = network.decode(shown, *found).joints_m - joints
+            if not (away_m := float(away.norm(dim=2).mean())) <= _WITHIN_M:
+                raise ToftrackError(
+                    f"in 8 bits the network's keypoints are {1e3 * away_m:.1f} mm away from torch's"
+                    f" (at most {1e3 * _WITHIN_M:g}), so nothing was written; give --float"
+                )
+            expected = {"heads": (found[0], heads)}
+    for name, (one, two) in expected.items():
+        apart = float((one - two).square().mean().sqrt() / two.std())
         if not apart <= _SPREAD:
             raise ToftrackError(
-                f"in 8 bits the finder's {name} is {100 * apart:.0f} % of its spread away from"
+                f"in 8 bits the network's {name} is {100 * apart:.0f} % of its spread away from"
                 f" torch's (at most {100 * _SPREAD:g}), so nothing was written; give --float"
             )
 
@@ -152,13 +146,9 @@ class _Images:
     """What onnxruntime.quantization reads: a CalibrationDataReader."""
 
     def __init__(self, name: str, images: np.ndarray) -> None:
-        self._batches = iter(
-            {name: images[start : start + _BATCH]} for start in range(0, len(images), _BATCH)
-        )
-
-    def get_next(self) -> dict[str, np.ndarray] | None:
-        """The next ones, None at the end."""
-        return next(self._batches, None)
+        starts = range(0, len(images), _BATCH)
+        batches = iter([{name: images[start : start + _BATCH]} for start in starts])
+        self.get_next = lambda: next(batches, None)
 
 
 _OPSET, _IR = 18, 10
@@ -190,34 +180,25 @@ def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:
     if missing := missing_packages():
         raise ToftrackError(needed(missing))
     loaded = load_weights(weights)
-    crops = torch.zeros(2, CROP_CHANNELS, CROP, CROP)
+    features = _Features(loaded.pose)
     several = torch.export.Dim("n", min=1, max=1 << 16)
     # In multiples, as `crops.wide` makes them.
-    rows, columns = (
-        WIDE_MULTIPLE * torch.export.Dim(name, min=1, max=1 << 12) for name in ("h", "w")
-    )
-    outputs = {
-        "pose": ["heads", "keypoints", "parts"],
-        "finder": list(Found._fields),
-    }
+    high, wide = (WIDE_MULTIPLE * torch.export.Dim(name, min=1, max=1 << 12) for name in ("h", "w"))
+    crop = CROP_CHANNELS, CROP, CROP
+    whole = 2, 5 * WIDE_MULTIPLE, 6 * WIDE_MULTIPLE
+    outputs = ["heads", "keypoints", "parts"]
     contents = {
-        "pose": _exported(_Features(loaded.pose), crops, "crops", outputs["pose"], {0: several}),
+        "pose": _exported(features, crop, "crops", outputs, {0: several}),
         "finder": _exported(
-            loaded.finder,
-            torch.zeros(2, 2, 5 * WIDE_MULTIPLE, 6 * WIDE_MULTIPLE),
-            "images",
-            outputs["finder"],
-            {0: several, 2: rows, 3: columns},
+            loaded.finder, whole, "images", list(Found._fields), {0: several, 2: high, 3: wide}
         ),
     }
-    _compare(_Features(loaded.pose), contents["pose"], "crops", crops.shape[1:])
+    _compare(features, contents["pose"], "crops", crop)
     _compare(loaded.finder, contents["finder"], "images", (2, 3 * WIDE_MULTIPLE, 4 * WIDE_MULTIPLE))
     if whole_numbers:
-        examples = {"pose": example_crops(), "finder": example_images()}
-        for network, images in examples.items():
+        for network, images in (("pose", example_crops()), ("finder", example_images())):
             contents[network] = quantised(contents[network], images[:-COMPARED])
-        compare(loaded.pose, contents["pose"], examples["pose"][-COMPARED:])
-        compare_finder(loaded.finder, contents["finder"], examples["finder"][-COMPARED:])
+            compare(getattr(loaded, network), contents[network], images[-COMPARED:])
     files = []
     for network, content in contents.items():
         facts = {"format": FORMAT, "version": VERSION, "network": network}
@@ -241,13 +222,17 @@ class _Features(nn.Module):
 
 
 def _exported(
-    network: nn.Module, example: Tensor, name: str, outputs: list[str], sizes: dict[int, Any]
+    network: nn.Module,
+    shape: tuple[int, ...],
+    name: str,
+    outputs: list[str],
+    sizes: dict[int, Any],
 ) -> Any:
-    """A network as an onnx.ModelProto; sizes: of the example, which may be others."""
+    """A network as an onnx.ModelProto; shape: of an image; sizes: which may be others."""
     with _quiet():
         program = torch.onnx.export(
             network.eval(),
-            (example,),
+            (torch.zeros(2, *shape),),
             dynamo=True,
             input_names=[name],
             output_names=outputs,
@@ -258,12 +243,8 @@ def _exported(
     assert program is not None
     model = program.model_proto
     model.ir_version = min(model.ir_version, _IR)
-    for part in (
-        *model.graph.node,
-        *model.graph.input,
-        *model.graph.output,
-        *model.graph.value_info,
-    ):
+    graph = model.graph
+    for part in (*graph.node, *graph.input, *graph.output, *graph.value_info):
         del part.metadata_props[:]  # where in the source it stands
     return model
 
@@ -275,9 +256,8 @@ def _compare(network: nn.Module, model: Any, name: str, shape: tuple[int, ...]) 
     generator = torch.Generator().manual_seed(0)
     for count in (1, 3):
         images = 2 * torch.rand(count, *shape, generator=generator) - 1
-        for one, two in zip(
-            network(images), session.run(None, {name: images.numpy()}), strict=True
-        ):
+        found = session.run(None, {name: images.numpy()})
+        for one, two in zip(network(images), found, strict=True):
             away = float(np.abs(one.numpy() - two).max())
             if not away <= _AGREE * max(1.0, float(one.abs().max())):
                 raise ToftrackError(

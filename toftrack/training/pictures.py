@@ -9,13 +9,15 @@ missing, steps, shadows beside near things, hollows that seem deeper than they a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
+from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
+from toftrack.detector.network import PARTS
 from toftrack.training.dice import Dice
 from toftrack.training.hands import FOREARM, THING
 from toftrack.training.scenes import Scenes
@@ -27,9 +29,9 @@ from toftrack.training.things_numba import TILE, draw_part
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
 ) = range(13)  # fmt: skip
 SENSOR_TERMS = 13
-ONE_SURFACE_M = np.float32(0.03)
+_ONE_SURFACE_M = np.float32(0.03)
 """A camera's filter smooths over steps of less than this."""
-HOLLOW_M, HOLLOW_DEPTH_M = np.float32(0.05), np.float32(0.06)
+_HOLLOW_M, _HOLLOW_DEPTH_M = np.float32(0.05), np.float32(0.06)
 """Hollows are at most so wide and so deep; what lies farther back is another surface."""
 _LATEST = 1.2
 """By what part of its depth a hollow seems deeper, at most."""
@@ -81,88 +83,50 @@ def random_sensors(n: int, dice: Dice) -> Tensor:
     return terms
 
 
-@dataclass(frozen=True, eq=False)
-class Shots:
-    """All that pictures of N scenes are made of, as float32 but for what is said.
-
-    centres: (N, M, 3).  axes: (N, M, 3, 3).  whiten: their inverses.  which: (N, M) int8 labels of
-    ellipsoids, -1 = not drawn.  planes: (N, P, 4).
-    primitives: (N, S, K, PRIMITIVE) of S hands' skins.  whose: (N, S, K) int8 labels.
-    widths: (N, S, 2) how far a skin blends and lies outside.  parts: (N, Q, PART).
-    lens: (N, 5), see Lens.  sensors: (N, SENSOR_TERMS).  seeds: (N,) int64, of the sensors' noise.
-    """
-
-    centres: Tensor
-    axes: Tensor
-    whiten: Tensor
-    which: Tensor
-    planes: Tensor
-    primitives: Tensor
-    whose: Tensor
-    widths: Tensor
-    parts: Tensor
-    lens: Tensor
-    sensors: Tensor
-    seeds: Tensor
-
-
-def shots(scenes: Scenes, lens: Lens, sensors: Tensor, dice: Dice) -> Shots:
-    """Pictures to take of scenes, on the CPU by `take`, or on a device by pictures_triton."""
-    n = len(sensors)
-    primitives, whose, widths = _skins(scenes)
-    return Shots(
-        _plain(scenes.centres_m),
-        _plain(scenes.axes_m),
-        _plain(torch.linalg.inv(scenes.axes_m)),
-        torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8),
-        _plain(scenes.planes),
-        primitives,
-        whose,
-        widths,
-        _plain(scenes.parts),
-        _plain(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)),
-        _plain(sensors),
-        torch.randint(1, 2**31 - 1, (n,), generator=dice.generator),
-    )
-
-
 def take_pictures(
     scenes: Scenes, lens: Lens, sensors: Tensor, size: tuple[int, int], dice: Dice
 ) -> tuple[np.ndarray, np.ndarray]:
-    """`take` of `shots`."""
-    return take(shots(scenes, lens, sensors, dice), size)
-
-
-def take(shots: Shots, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Depth (N, H, W) float32, 0 = no reading, and labels (N, H, W) int8, -1 = not seen.
 
     size: H, W of the arrays; each picture fills its own width and height of them.
     """
-    n = len(shots.sensors)
+    n = len(sensors)
     depth = np.zeros((n, *size), np.float32)
     labels = np.full((n, *size), -1, np.int8)
-    arrays = {field.name: getattr(shots, field.name).numpy() for field in fields(shots)}
-    seeds = arrays.pop("seeds").astype(np.uint32)
-    _take(*arrays.values(), seeds, depth, labels)
+    seeds = torch.randint(1, 2**31 - 1, (n,), generator=dice.generator)
+    which = torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8)
+    axes = scenes.axes_m
+    ellipsoids = (_plain(scenes.centres_m), _plain(axes), _plain(torch.linalg.inv(axes)))
+    lenses = torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)
+    _take(
+        (*ellipsoids, which.numpy()),
+        _skins(scenes),
+        (_plain(scenes.planes), _plain(scenes.parts)),
+        (_plain(lenses), _plain(sensors), seeds.numpy().astype(np.uint32)),
+        depth,
+        labels,
+    )
     return depth, labels
 
 
-def _skins(scenes: Scenes) -> tuple[Tensor, Tensor, Tensor]:
-    """Primitives, labels and widths of the hands' skins, see Shots."""
+def _skins(scenes: Scenes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of S hands' skins, (N, S, K, PRIMITIVE) primitives, (N, S, K) int8 labels, and (N, S, 2) how
+    far a skin blends and lies outside.
+    """
     n, skins = len(scenes.labels), scenes.skins
     if not skins:
-        none = torch.zeros(n, 0, 1, PRIMITIVE), torch.zeros(n, 0, 1, dtype=torch.int8)
-        return *none, torch.zeros(n, 0, 2)
+        none = np.zeros((n, 0, 1, PRIMITIVE), np.float32), np.zeros((n, 0, 1), np.int8)
+        return *none, np.zeros((n, 0, 2), np.float32)
     widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin, _ in skins]
     return (
         _plain(torch.stack([skin.primitives for skin, _ in skins], 1)),
-        torch.stack([labels for _, labels in skins], 1).to(torch.int8).contiguous(),
+        torch.stack([labels for _, labels in skins], 1).to(torch.int8).numpy(),
         _plain(torch.stack(widths, 1)),
     )
 
 
-def _plain(tensor: Tensor) -> Tensor:
-    return tensor.detach().to(torch.float32).contiguous()
+def _plain(tensor: Tensor) -> np.ndarray:
+    return tensor.float().contiguous().numpy()
 
 
 @compiled
@@ -244,7 +208,7 @@ def _smooth(reach, width, height, depth, scratch, total, count):
             for shift in range(-reach, reach + 1):
                 for u in range(max(-shift, 0), width - max(shift, 0)):
                     other = scratch[v2, u + shift]
-                    near = (other > 0) & (abs(other - scratch[v, u]) < ONE_SURFACE_M)
+                    near = (other > 0) & (abs(other - scratch[v, u]) < _ONE_SURFACE_M)
                     total[u] += other if near else np.float32(0)
                     count[u] += np.float32(1) if near else np.float32(0)
         for u in range(width):
@@ -264,7 +228,7 @@ def _deepen(part, lens, depth, around, scratch):
     for v in range(height):
         for u in range(width):
             nearest = min(nearest, depth[v, u])
-    reach = int(np.float32(0.5) * HOLLOW_M * lens[0] / (nearest + HOLLOW_DEPTH_M))
+    reach = int(np.float32(0.5) * _HOLLOW_M * lens[0] / (nearest + _HOLLOW_DEPTH_M))
     for v in range(height):
         for u in range(width):
             around[v, u] = depth[v, u]
@@ -287,7 +251,7 @@ def _deepen(part, lens, depth, around, scratch):
     for v in range(height):
         for u in range(width):
             hollow = depth[v, u] - around[v, u]
-            if hollow < HOLLOW_DEPTH_M:
+            if hollow < _HOLLOW_DEPTH_M:
                 depth[v, u] += part * hollow
 
 
@@ -345,31 +309,19 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
 
 
 @entry_point
-def _take(
-    centres,
-    axes,
-    whiten,
-    which,
-    planes,
-    skins,
-    whose,
-    widths,
-    parts,
-    lenses,
-    sensors,
-    seeds,
-    depth,
-    labels,
-):
-    """All pictures of a batch, see Shots."""
+def _take(ellipsoids, skins, others, cameras, depth, labels):
+    """All pictures of a batch, see take_pictures."""
+    (centres, axes, whiten, which), (primitives, whose, widths) = ellipsoids, skins
+    (planes, parts), (lenses, sensors, seeds) = others, cameras
     state = np.zeros(1, np.uint32)
     tiles = (depth.shape[1] // TILE + 1) * (depth.shape[2] // TILE + 1)
-    count = skins.shape[2]
+    count = primitives.shape[2]
     balls, lists = np.empty((count, 4), np.float32), np.empty((tiles, count), np.int64)
     counts, on = np.empty(tiles, np.int64), np.empty(count, np.int64)
     near = np.empty(count, np.float32)
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
+    work = balls, lists, counts, on, near, rays
     clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
     around = np.empty(depth.shape[1:], np.float32)
     rows = np.empty((2, depth.shape[2]), np.float32)
@@ -395,22 +347,87 @@ def _take(
         for q in range(parts.shape[1]):
             if parts[n, q, 0] >= 0:
                 draw_part(parts[n, q], THING, lens, clean, labels[n])
-        for s in range(skins.shape[1]):
-            draw_skin(
-                skins[n, s],
-                whose[n, s],
-                widths[n, s, 0],
-                widths[n, s, 1],
-                lens,
-                clean,
-                labels[n],
-                balls,
-                lists,
-                counts,
-                on,
-                near,
-                rays,
-            )
+        for s in range(primitives.shape[1]):
+            skin = primitives[n, s], whose[n, s], widths[n, s, 0], widths[n, s, 1]
+            draw_skin(skin, lens, clean, labels[n], work)
         if sensors[n, HOLLOW] > 0:
             _deepen(sensors[n, HOLLOW], lens, clean, around, scratch)
         _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)
+
+
+_PER_PART = CROP // PARTS
+_SCALE, _QUARTER = np.float32(2 / CROP_M), np.float32(0.25)
+
+
+def read_pictures(
+    depth: np.ndarray,
+    labels: np.ndarray,
+    side: Tensor,
+    distance_m: Tensor,
+    turn: Tensor,
+    border: Tensor,
+) -> tuple[Tensor, Tensor]:
+    """Crops (N, CROP_CHANNELS, CROP, CROP) of pictures, see detector/crops.py, and parts
+    (N, PARTS, PARTS).
+
+    depth, labels: (N, H, W) of side (N, 2) int32 pixels: of the picture and, in its middle, of the
+    crop.  distance_m: (N,) of the crops' centres.  turn: (N,) by how much crops are turned about
+    their centres, radians, see crops.upright_angle.
+    border: (N, 2, 3) what is in the image, a x + b y < c for x, y in -0.5 .. 0.5 across the crop as
+    it were without its turn; parts beyond are -1, and nothing is read there.
+    """
+    n = len(depth)
+    image = np.zeros((n, CROP_CHANNELS, CROP, CROP), np.float32)
+    parts = np.empty((n, PARTS, PARTS), np.int8)
+    crops = side.numpy(), distance_m.numpy(), turn.numpy(), border.numpy()
+    _read(depth, labels, *crops, image, parts)
+    return torch.from_numpy(image), torch.from_numpy(parts).long()
+
+
+@entry_point
+def _read(depth, labels, side, distance, turn, border, image, parts):
+    shown = np.empty((2 * CROP, 2 * CROP), np.int8)
+    for n in range(len(depth)):
+        edge, each, cosine, sine = border[n], side[n, 1], math.cos(turn[n]), math.sin(turn[n])
+        middle = 0.5 * side[n, 0]
+        for row in range(CROP):
+            for column in range(CROP):
+                total, near, count, outside = np.float32(0), 0, 0, 0
+                image[n, 4:, row, column] = 1
+                for line in range(2 * row, 2 * row + 2):
+                    down = (line + 0.5) / (2 * CROP) - 0.5
+                    for sample in range(2 * column, 2 * column + 2):
+                        across = (sample + 0.5) / (2 * CROP) - 0.5
+                        x = cosine * across - sine * down
+                        y = sine * across + cosine * down
+                        if (
+                            edge[0, 0] * x + edge[0, 1] * y >= edge[0, 2]
+                            or edge[1, 0] * x + edge[1, 1] * y >= edge[1, 2]
+                        ):
+                            outside += 1
+                            shown[line, sample] = -1
+                            continue
+                        v = min(max(int(middle + y * each), 0), side[n, 0] - 1)
+                        u = min(max(int(middle + x * each), 0), side[n, 0] - 1)
+                        shown[line, sample] = labels[n, v, u]
+                        z = depth[n, v, u]
+                        if z > 0:
+                            relative = (z - distance[n]) * _SCALE
+                            clipped = min(max(relative, np.float32(-1)), np.float32(1))
+                            total += clipped
+                            reading = 4 + 2 * (line - 2 * row) + sample - 2 * column
+                            image[n, reading, row, column] = clipped
+                            near += abs(relative) < 1
+                            count += 1
+                image[n, 0, row, column] = total / count if count > 0 else 1
+                image[n, 1, row, column] = near * _QUARTER
+                image[n, 2, row, column] = 1 - count * _QUARTER
+                image[n, 3, row, column] = outside * _QUARTER
+        for row in range(PARTS):
+            for column in range(PARTS):
+                # At the middle of the part, as far as there is a sample.
+                line = 2 * _PER_PART * row + _PER_PART
+                sample = 2 * _PER_PART * column + _PER_PART
+                parts[n, row, column] = shown[line, sample]
+                if image[n, 3, line // 2, sample // 2] > 0.5:
+                    parts[n, row, column] = -1

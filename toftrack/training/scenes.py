@@ -52,15 +52,13 @@ def moved(scenes: Scenes, by_m: Tensor) -> Scenes:
     )
 
 
-def surroundings(
-    hands: Hands, distance_m: Tensor, dice: Dice, views: Tensor | None = None
-) -> tuple[Tensor, Tensor, Tensor]:
+def surroundings(hands: Hands, dice: Dice, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The person behind a raised hand: upper arm, torso, head; (N, B, 3), (N, B, 3, 3), (N, B).
 
-    views: (N,) where the cameras are; None = before the persons. From the head nothing is seen of
-    the person, from above seldom.
+    views: (N,) where the cameras are. From the head nothing is seen of the person, from above
+    seldom.
     """
-    n = len(distance_m)
+    n = len(views)
     away = torch.tensor([0.0, -0.35, 0.8]) + 0.6 * dice.normal(n, 3)
     away = torch.nn.functional.normalize(away, dim=1)
     shoulder = hands.elbow_m + 0.27 * away
@@ -98,8 +96,7 @@ def surroundings(
     ball = straight * torch.tensor([0.07, 0.07, 0.07])
     axes = torch.cat((body_axes, arm_axes[:, None], hanging[:, None], ball[:, None]), 1)
     there = dice.chance(0.7, n)
-    if views is not None:
-        there &= (views == FRONT) | ((views == ABOVE) & dice.chance(0.25, n))
+    there &= (views == FRONT) | ((views == ABOVE) & dice.chance(0.25, n))
     labels = torch.where(there[:, None], BACKGROUND, -1).expand(n, 6).clone()
     labels[:, 3] = torch.where(there & (arm.norm(dim=1) < 0.5), BACKGROUND, -1)
     return centres, axes, labels

@@ -62,7 +62,7 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
     place = _places(keys, width / focal, height / focal, dice)
     views = random_views(1, dice)
     rotations = _rotations(keys, dice, views)
-    angles = _held(shown_poses(keys, generator), dice)
+    angles = _held(shown_poses(keys, dice), dice)
     there = dice.chance(FURNISHED[empty], 1)
     others = 0.0 if empty else 0.2  # which may be as right a hand as the missing one
     scene = int(torch.randint(2**31 - 1, (1,), generator=generator))

@@ -50,13 +50,15 @@ class ShapeBank:
 
     def rows(self, rows: Tensor) -> tuple[HandShape, HandSurface]:
         """The hands of (N,) rows, for N states at once."""
-        shape = HandShape(
-            self.shape.base_m[rows], self.shape.base_frames[rows], self.shape.bone_lengths_m[rows]
-        )
-        surface = HandSurface(
-            self.surface.frame_index, self.surface.centres_m[rows], self.surface.axes_m[rows]
-        )
-        return shape, surface
+        return rows_of(self.shape, self.surface, rows)
+
+
+def rows_of(shape: HandShape, surface: HandSurface, rows: Tensor) -> tuple[HandShape, HandSurface]:
+    """Some of several hands."""
+    return (
+        HandShape(shape.base_m[rows], shape.base_frames[rows], shape.bone_lengths_m[rows]),
+        HandSurface(surface.frame_index, surface.centres_m[rows], surface.axes_m[rows]),
+    )
 
 
 def shape_bank(count: int, generator: torch.Generator) -> ShapeBank:
@@ -65,30 +67,23 @@ def shape_bank(count: int, generator: torch.Generator) -> ShapeBank:
     The spreads are wider than those between people (coefficients of variation of 5 to 10 %, ANSUR
     II), so that a real hand, whose surface is no set of ellipsoids, lies within them.
     """
-    shapes, surfaces = [], []
-    for _ in range(count):
-        shape = _random_shape(generator)
-        shapes.append(shape)
-        surfaces.append(_random_surface(shape, generator))
-    stacked = HandShape(
-        torch.stack([s.base_m for s in shapes]),
-        torch.stack([s.base_frames for s in shapes]),
-        torch.stack([s.bone_lengths_m for s in shapes]),
+    dice = Dice(generator)
+    shapes, surfaces = zip(*(_random_hand(dice) for _ in range(count)), strict=True)
+    shape = HandShape(
+        torch.stack([one.base_m for one in shapes]),
+        torch.stack([one.base_frames for one in shapes]),
+        torch.stack([one.bone_lengths_m for one in shapes]),
     )
-    surface = HandSurface(
-        surfaces[0].frame_index,
-        torch.stack([s.centres_m for s in surfaces]),
-        torch.stack([s.axes_m for s in surfaces]),
-    )
-    lengths = torch.tensor([s.hand_length_m for s in shapes])
-    return ShapeBank(stacked, surface, (lengths / DEFAULT_HAND_LENGTH_M).log())
+    centres = torch.stack([one.centres_m for one in surfaces])
+    axes = torch.stack([one.axes_m for one in surfaces])
+    lengths = torch.tensor([one.hand_length_m for one in shapes])
+    surface = HandSurface(surfaces[0].frame_index, centres, axes)
+    return ShapeBank(shape, surface, (lengths / DEFAULT_HAND_LENGTH_M).log())
 
 
-def _random_shape(generator: torch.Generator) -> HandShape:
-    def normal(*size: int) -> Tensor:
-        return torch.randn(*size, generator=generator)
-
-    log_length = torch.rand(1, generator=generator) * math.log(_LONGEST_M / _SHORTEST_M)
+def _random_hand(dice: Dice) -> tuple[HandShape, HandSurface]:
+    normal = dice.normal
+    log_length = dice.uniform(1) * math.log(_LONGEST_M / _SHORTEST_M)
     mean = default_hand_shape(_SHORTEST_M * math.exp(float(log_length)))
     scale = float(mean.hand_length_m) / DEFAULT_HAND_LENGTH_M
     palm = 1 + torch.tensor([0.08, 0.05, 0.08]) * normal(3)
@@ -96,21 +91,18 @@ def _random_shape(generator: torch.Generator) -> HandShape:
     base[0] += 0.003 * scale * normal(3)
     lengths = 1 + 0.05 * normal(1, 1) + 0.05 * normal(5, 1) + 0.03 * normal(5, 3)
     # Against the others, people's last bones are longer than the mean shape's.
-    lengths[:, 2] *= 1.0 + _LONGEST_TIP * torch.rand(1, generator=generator) + 0.04 * normal(5)
+    lengths[:, 2] *= 1.0 + _LONGEST_TIP * dice.uniform(1) + 0.04 * normal(5)
     rotations = normal(5, 3) * math.radians(3.0)
     rotations[0] *= 2.5
     frames = mean.base_frames @ roma.rotvec_to_rotmat(rotations)
     thickness = float((1 + 0.10 * normal(1)).clamp(0.75, 1.35))
-    return HandShape(base, frames, mean.bone_lengths_m * lengths, thickness)
-
-
-def _random_surface(shape: HandShape, generator: torch.Generator) -> HandSurface:
+    shape = HandShape(base, frames, mean.bone_lengths_m * lengths, thickness)
     surface = hand_surface(shape)
     count = len(surface.centres_m)
     scale = shape.hand_length_m / DEFAULT_HAND_LENGTH_M
-    grown = 1 + 0.06 * torch.randn(count, 1, 3, generator=generator)
-    moved = 0.0015 * scale * torch.randn(count, 3, generator=generator)
-    return HandSurface(surface.frame_index, surface.centres_m + moved, surface.axes_m * grown)
+    grown = 1 + 0.06 * normal(count, 1, 3)
+    centres = surface.centres_m + 0.0015 * scale * normal(count, 3)
+    return shape, HandSurface(surface.frame_index, centres, surface.axes_m * grown)
 
 
 def cupped(

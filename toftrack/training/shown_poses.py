@@ -17,6 +17,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.data.pose_data import recorded_poses
+from toftrack.training.dice import Dice
 
 KINDS = {
     "shown": 0.42,  # SHOWN
@@ -139,137 +140,129 @@ _ONE_BY_ONE = 0.25
 """Standard deviation of how much further than its neighbour a finger is on its way."""
 
 
-def shown_poses(n: int, generator: torch.Generator) -> Tensor:
+def shown_poses(n: int, dice: Dice) -> Tensor:
     """(n, 21) joint angles, radians, within the joint limits, of KINDS."""
-    shown, second = shown_only(n, generator), shown_only(n, generator)
-    fingers = any_fingers(n, generator)
-    other = torch.where(_uniform(generator, n, 1) < 0.3, fingers, second)
-    moving = on_the_way(shown, other, generator)
+    shown, second = shown_only(n, dice), shown_only(n, dice)
+    fingers = any_fingers(n, dice)
+    other = torch.where(dice.uniform(n, 1) < 0.3, fingers, second)
+    moving = on_the_way(shown, other, dice)
     poses = {
         "shown": shown,
-        "pinch": pinched(torch.where(_uniform(generator, n, 1) < 0.3, fingers, second), generator),
+        "pinch": pinched(torch.where(dice.uniform(n, 1) < 0.3, fingers, second), dice),
         "moving": moving,
         "any": fingers,
-        "recorded": near_recorded(n, generator),
-        "crossed": fingers_of_two_recorded(n, generator),
+        "recorded": near_recorded(n, dice),
+        "crossed": fingers_of_two_recorded(n, dice),
     }
-    kind = torch.multinomial(torch.tensor(list(KINDS.values())), n, True, generator=generator)
+    kind = torch.multinomial(torch.tensor(list(KINDS.values())), n, True, generator=dice.generator)
     angles = torch.stack([poses[name] for name in KINDS])[kind, torch.arange(n)]
     return clamp_to_joint_limits(angles)
 
 
-def on_the_way(first: Tensor, last: Tensor, generator: torch.Generator) -> Tensor:
+def on_the_way(first: Tensor, last: Tensor, dice: Dice) -> Tensor:
     """(n, 21) between poses (n, 21) and others: each finger ahead or behind, and in half of them
     one after another, as a hand opens or closes from one side on.
     """
     n = len(first)
-    one_by_one = _ONE_BY_ONE * _normal(generator, n, 1) * (torch.arange(5.0) - 2.0)
-    part = _uniform(generator, n, 1) + 0.15 * _normal(generator, n, 5)
-    some = _uniform(generator, n, 1) < 0.5
+    one_by_one = _ONE_BY_ONE * dice.normal(n, 1) * (torch.arange(5.0) - 2.0)
+    part = dice.uniform(n, 1) + 0.15 * dice.normal(n, 5)
+    some = dice.uniform(n, 1) < 0.5
     part = (part + torch.where(some, one_by_one, 0.0)).clamp(0, 1)
     return torch.lerp(first, last, part[:, _FINGER_OF_ANGLE])
 
 
-def near_recorded(n: int, generator: torch.Generator) -> Tensor:
+def near_recorded(n: int, dice: Dice) -> Tensor:
     """(n, 21) radians, recorded poses, each a little changed; not yet within the limits."""
     recorded = recorded_poses()
-    rows = torch.randint(len(recorded), (n,), generator=generator)
-    return recorded[rows] + math.radians(3.0) * _normal(generator, n, 21)
+    return recorded[dice.rows(len(recorded), n)] + math.radians(3.0) * dice.normal(n, 21)
 
 
-def fingers_of_two_recorded(n: int, generator: torch.Generator) -> Tensor:
+def fingers_of_two_recorded(n: int, dice: Dice) -> Tensor:
     """(n, 21) radians, each finger of one of two recorded poses; not yet within the limits."""
-    first, second = near_recorded(n, generator), near_recorded(n, generator)
-    chosen = _uniform(generator, n, 5)[:, _FINGER_OF_ANGLE] < 0.5
+    first, second = near_recorded(n, dice), near_recorded(n, dice)
+    chosen = dice.uniform(n, 5)[:, _FINGER_OF_ANGLE] < 0.5
     return torch.where(chosen, first, second)
 
 
-def any_fingers(n: int, generator: torch.Generator) -> Tensor:
+def any_fingers(n: int, dice: Dice) -> Tensor:
     """(n, 21) radians, each finger straight or curled, or in any state, or all closing together;
     not yet within the limits.
     """
-    counting = (_uniform(generator, n, 4) < 0.5).long()
-    anything = torch.randint(len(_ANY_MEANS), (n, 4), generator=generator)
-    kind = _uniform(generator, n, 1)
+    counting = (dice.uniform(n, 4) < 0.5).long()
+    anything = torch.randint(len(_ANY_MEANS), (n, 4), generator=dice.generator)
+    kind = dice.uniform(n, 1)
     state = torch.where(kind < 0.55, counting, anything)
-    flexion = _ANY_MEANS[state] + _ANY_DEVIATIONS[state] * _normal(generator, n, 4, 3)
+    flexion = _ANY_MEANS[state] + _ANY_DEVIATIONS[state] * dice.normal(n, 4, 3)
     # All four together: from straight to curled, the middle joints ahead of the knuckles.
-    closing = _uniform(generator, n, 1, 1) * 1.2 - 0.1 + 0.08 * _normal(generator, n, 4, 1)
-    exponent = torch.exp(0.35 * _normal(generator, n, 1, 3))
+    closing = dice.uniform(n, 1, 1) * 1.2 - 0.1 + 0.08 * dice.normal(n, 4, 1)
+    exponent = torch.exp(0.35 * dice.normal(n, 1, 3))
     straight, curled = _ANY_MEANS[:2]
     together = straight + (curled - straight) * closing.clamp(0, 1) ** exponent
-    together = together + 5.0 * _normal(generator, n, 4, 3)
+    together = together + 5.0 * dice.normal(n, 4, 3)
     flexion = torch.where(kind[..., None] > 0.75, together, flexion)
     thumbs = torch.tensor(list(_THUMBS.values()), dtype=torch.float32)
-    first, last = torch.randint(len(thumbs), (2, n), generator=generator)
-    part = (_uniform(generator, n, 1) * 1.6 - 0.3).clamp(0, 1)
+    first, last = torch.randint(len(thumbs), (2, n), generator=dice.generator)
+    part = (dice.uniform(n, 1) * 1.6 - 0.3).clamp(0, 1)
     thumb = torch.lerp(thumbs[first], thumbs[last], part)
-    spread = torch.tensor(_SPREAD) * (_uniform(generator, n, 1) * 1.6 - 0.4)
-    abduction = spread + 4.0 * _normal(generator, n, 4)
+    spread = torch.tensor(_SPREAD) * (dice.uniform(n, 1) * 1.6 - 0.4)
+    abduction = spread + 4.0 * dice.normal(n, 4)
     fingers = torch.cat((abduction[..., None], flexion), 2).flatten(1)
-    thumb = thumb + 8.0 * _normal(generator, n, 5)
+    thumb = thumb + 8.0 * dice.normal(n, 5)
     return torch.deg2rad(torch.cat((thumb, fingers), 1))
 
 
-def shown_only(n: int, generator: torch.Generator, rows: Tensor | None = None) -> Tensor:
+def shown_only(n: int, dice: Dice, rows: Tensor | None = None) -> Tensor:
     """(n, 21) of SHOWN, by its weights or of these rows, each in an own way."""
     if rows is None:
         weights = torch.tensor([float(shown.weight) for shown in SHOWN])
-        rows = torch.multinomial(weights, n, True, generator=generator)
+        rows = torch.multinomial(weights, n, True, generator=dice.generator)
     names = list(_STATES)
     state = torch.tensor([[names.index(f) for f in shown.fingers] for shown in SHOWN])[rows]
-    flat = (_uniform(generator, n, 1) < _FLAT_KNUCKLES) & (state == names.index("tight"))
+    flat = (dice.uniform(n, 1) < _FLAT_KNUCKLES) & (state == names.index("tight"))
     state = torch.where(flat, names.index("folded"), state)
     means = torch.tensor([mean for mean, _ in _STATES.values()], dtype=torch.float32)
     deviations = torch.tensor([deviation for _, deviation in _STATES.values()], dtype=torch.float32)
     # One way of bending for all fingers of a person, and a little of each finger's own.
-    noise = 0.6 * _normal(generator, n, 1, 3) + 0.6 * _normal(generator, n, 4, 3)
+    noise = 0.6 * dice.normal(n, 1, 3) + 0.6 * dice.normal(n, 4, 3)
     flexion = means[state] + deviations[state] * noise
     spread = torch.tensor([shown.spread for shown in SHOWN])[rows]
-    return torch.cat((_thumbs(rows, generator), _fingers(flexion, spread, generator)), 1)
+    return torch.cat((_thumbs(rows, dice), _fingers(flexion, spread, dice)), 1)
 
 
-def _thumbs(rows: Tensor, generator: torch.Generator) -> Tensor:
+def _thumbs(rows: Tensor, dice: Dice) -> Tensor:
     """(n, 5) radians, one that goes with what is shown, or between two."""
     n = len(rows)
     names = list(_THUMBS)
     most = max(len(shown.thumbs) for shown in SHOWN)
     allowed = [[names.index(name) for name in (shown.thumbs * most)[:most]] for shown in SHOWN]
-    which = torch.randint(most, (2, n), generator=generator)
+    which = torch.randint(most, (2, n), generator=dice.generator)
     first, second = (torch.tensor(allowed)[rows].gather(1, w[:, None])[:, 0] for w in which)
     thumbs = torch.tensor(list(_THUMBS.values()), dtype=torch.float32)
-    thumb = torch.lerp(thumbs[first], thumbs[second], 0.5 * _uniform(generator, n, 1))
-    return torch.deg2rad(thumb + 7.0 * _normal(generator, n, 5))
+    thumb = torch.lerp(thumbs[first], thumbs[second], 0.5 * dice.uniform(n, 1))
+    return torch.deg2rad(thumb + 7.0 * dice.normal(n, 5))
 
 
-def _fingers(flexion: Tensor, spread: Tensor, generator: torch.Generator) -> Tensor:
+def _fingers(flexion: Tensor, spread: Tensor, dice: Dice) -> Tensor:
     """(n, 16) radians from flexions (n, 4, 3) in degrees and how fingers are spread (n,)."""
     n = len(spread)
-    kinds = torch.stack(
-        (
-            _uniform(generator, n) * 1.3 + 0.3,
-            _uniform(generator, n) * 0.35 - 1.2,
-            _uniform(generator, n) * 1.6 - 0.6,
-            _uniform(generator, n) * 0.5 - 0.2,
-        ),
-        1,
-    )
+    wide, least = torch.tensor([[1.3, 0.35, 1.6, 0.5], [0.3, -1.2, -0.6, -0.2]])
+    kinds = dice.uniform(4, n).T * wide + least
     part = kinds.gather(1, spread[:, None])
     own = torch.where(spread == _TOGETHER, 1.2, 4.0)[:, None]
-    bent_part = _BENT_SPREAD[0] + (_BENT_SPREAD[1] - _BENT_SPREAD[0]) * _uniform(generator, n, 1)
+    bent_part = _BENT_SPREAD[0] + (_BENT_SPREAD[1] - _BENT_SPREAD[0]) * dice.uniform(n, 1)
     bent = (flexion[..., :2].amax(2) / _BENT_DEG).clamp(0, 1)
     part = torch.lerp(part.expand(n, 4), bent_part.expand(n, 4), bent)
-    abduction = torch.tensor(_SPREAD) * part + own * _normal(generator, n, 4)
+    abduction = torch.tensor(_SPREAD) * part + own * dice.normal(n, 4)
     across = torch.tensor([-14.0, 10.0, 0.0, 0.0])
     abduction = torch.where((spread == _CROSSED)[:, None], abduction + across, abduction)
     return torch.deg2rad(torch.cat((abduction[..., None], flexion), 2).flatten(1))
 
 
-def pinched(poses: Tensor, generator: torch.Generator) -> Tensor:
+def pinched(poses: Tensor, dice: Dice) -> Tensor:
     """The same poses (N, 21), the thumb's tip touching that of one finger, each as often."""
     pairs = touching_pairs()
-    finger = torch.randint(4, (len(poses),), generator=generator)
-    part = _uniform(generator, len(poses))
+    finger = dice.rows(4, len(poses))
+    part = dice.uniform(len(poses))
     row = torch.stack([(part * len(thumbs)).long() for thumbs, _ in pairs], 1)
     result = poses.clone()
     for number, (thumbs, fingers) in enumerate(pairs):
@@ -281,27 +274,20 @@ def pinched(poses: Tensor, generator: torch.Generator) -> Tensor:
 
 
 @functools.cache
-def touching_pairs(most_m: float = _TOUCHING_M) -> tuple[tuple[Tensor, Tensor], ...]:
+def touching_pairs() -> tuple[tuple[Tensor, Tensor], ...]:
     """Thumbs (P, 5) and fingers (P, 4), for each finger, whose tips are so near to each other."""
-    generator = torch.Generator().manual_seed(0)
-    n = 60_000
+    n, dice = 60_000, Dice(torch.Generator().manual_seed(0))
     low, high = torch.tensor(ANGLE_LIMITS)[:5].unbind(1)
-    thumb = low + (high - low) * torch.rand(n, 5, generator=generator)
+    thumb = low + (high - low) * dice.uniform(n, 5)
     thumb[:, 3:] = thumb[:, 3:].clamp(min=-0.1)
-    bent = torch.tensor([75.0, 80.0, 50.0]) * torch.rand(n, 3, generator=generator)
-    fingers = torch.cat((8.0 * torch.randn(n, 1, generator=generator), bent), 1).deg2rad()
+    bent = torch.tensor([75.0, 80.0, 50.0]) * dice.uniform(n, 3)
+    fingers = torch.cat((8.0 * dice.normal(n, 1), bent), 1).deg2rad()
     state = torch.cat((torch.zeros(n, 6), thumb, fingers.repeat(1, 4)), 1)
     joints = forward_kinematics(state, default_hand_shape()).joints_m
     found = []
     for finger in range(4):
-        rows = ((joints[:, 8 + 4 * finger] - joints[:, 4]).norm(dim=1) < most_m).nonzero()[:, 0]
+        rows = ((joints[:, 8 + 4 * finger] - joints[:, 4]).norm(dim=1) < _TOUCHING_M).nonzero()[
+            :, 0
+        ]
         found.append((thumb[rows], fingers[rows]))
     return tuple(found)
-
-
-def _uniform(generator: torch.Generator, *size: int) -> Tensor:
-    return torch.rand(*size, generator=generator)
-
-
-def _normal(generator: torch.Generator, *size: int) -> Tensor:
-    return torch.randn(*size, generator=generator)

@@ -53,14 +53,15 @@ def _primitive_distance(p, i, x, y, z):
 
 
 @compiled
-def draw_skin(
-    primitives, whose, blend, outside, lens, depth, labels, balls, lists, counts, on, near, rays
-):
-    """A hand's skin into the depth buffer, see skin.Skins; whose: (P,) labels, -1 = none.
+def draw_skin(skin, lens, depth, labels, work):
+    """A hand's skin into the depth buffer.
 
-    balls: (P, 4), lists: (tiles, P), counts: (tiles,), on and near: (P,), and rays: six arrays
+    skin: primitives, labels (P,), -1 = none, blend and outside, see skin.Skins.
+    work: balls (P, 4), lists (tiles, P), counts (tiles,), on and near (P,), and rays, six arrays
     (TILE * TILE,), to work in.
     """
+    primitives, whose, blend, outside = skin
+    balls, lists, counts, on, near, rays = work
     width, height = int(lens[3]), int(lens[4])
     f = lens[0]
     xs, ys, zs, union, nearest, which = rays
@@ -93,10 +94,8 @@ def draw_skin(
     for tile in range(rows * columns):
         if counts[tile] > 0:
             top, left = tile // columns * TILE, tile % columns * TILE
-            x, y = (
-                (np.float32(left) + MIDDLE - lens[1]) / f,
-                (np.float32(top) + MIDDLE - lens[2]) / f,
-            )
+            x = (np.float32(left) + MIDDLE - lens[1]) / f
+            y = (np.float32(top) + MIDDLE - lens[2]) / f
             here = lists[tile, : counts[tile]]
             apart = CORNER / f
             count, first, last = _met_balls(balls, here, on, x, y, apart)
@@ -111,19 +110,8 @@ def draw_skin(
             for ray in range(TILE * TILE):
                 xs[ray] = (np.float32(left + ray % TILE) - lens[1]) / f
                 ys[ray] = (np.float32(top + ray // TILE) - lens[2]) / f
-            _meet_skin(
-                primitives,
-                on,
-                near,
-                count,
-                (xs, ys),
-                (zs, union, nearest, which),
-                first,
-                last,
-                apart * first,
-                wide,
-                outside,
-            )
+            found, span = (zs, union, nearest, which), (first, last, apart * first)
+            _meet_skin(primitives, on, near, count, (xs, ys), found, span, wide, outside)
             for ray in range(TILE * TILE):
                 v, u = top + ray // TILE, left + ray % TILE
                 if v < height and u < width and abs(union[ray]) < _NEAR_M:
@@ -140,13 +128,9 @@ def _met_balls(balls, here, on, x, y, apart):
     count, first, last = 0, np.float32(9), np.float32(0)
     for i in here:
         r = balls[i, 3] + apart * balls[i, 2]
-        b = x * balls[i, 0] + y * balls[i, 1] + balls[i, 2]
-        c = (
-            balls[i, 0] * balls[i, 0]
-            + balls[i, 1] * balls[i, 1]
-            + balls[i, 2] * balls[i, 2]
-            - r * r
-        )
+        bx, by, bz = balls[i, 0], balls[i, 1], balls[i, 2]
+        b = x * bx + y * by + bz
+        c = bx * bx + by * by + bz * bz - r * r
         disc = b * b - square * c
         if disc > 0:
             root = math.sqrt(disc)
@@ -203,12 +187,14 @@ def _sort_by_distance(primitives, on, count, x, y, z, near):
 
 
 @compiled
-def _meet_skin(primitives, on, near, count, rays, found, first, last, apart, wide, outside):
-    """Where a tile's rays meet the skin, from `first` on: z, and what is near there, in `found`.
+def _meet_skin(primitives, on, near, count, rays, found, span, wide, outside):
+    """Where a tile's rays meet the skin: z, and what is near there, in `found`.
 
     rays: x and y of each at z = 1.  found: z, distance that is left, nearest primitive.
+    span: the first z and the last, and how far rays are apart at the first.
     All rays go together, so that their arithmetic is done at once.
     """
+    first, last, apart = span
     xs, ys = rays
     zs, union, nearest, which = found
     zs[:] = first

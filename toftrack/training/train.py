@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import os
@@ -46,14 +45,8 @@ def train(config: DictConfig) -> float:
             f"{needed(missing)}; otherwise training ends with {config.output} alone, and they are"
             f" made later by {COMMAND} {path}"
         )
-    drawable = importlib.util.find_spec("triton") is not None
-    found = "cuda" if torch.cuda.is_available() and drawable else "cpu"
+    found = "cuda" if torch.cuda.is_available() else "cpu"
     device = compute_device(found if config.compute == "auto" else config.compute)
-    if device.type == "cuda" and not drawable:
-        raise ToftrackError(
-            "compute=cuda draws the training images with triton, which is not installed; install"
-            " it, or give compute=cpu"
-        )
     poses = hydra.utils.instantiate(config.poses)
     finder = hydra.utils.instantiate(config.finder)
     if not (isinstance(config.shapes, int) and config.shapes > 0):
