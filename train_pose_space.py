@@ -2,7 +2,7 @@
 
 import sys
 
-import toftrack.early_interrupt  # noqa: F401  # before all others
+import toftrack.programs.early_interrupt  # noqa: F401  # before all others
 from toftrack.programs.main import main
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 import toftrack
 from toftrack.configuration.compose import configuration
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 
 QUICK = ("filter.particles=100",)
 

@@ -7,8 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from toftrack.checks import check_number
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 
 
 @pytest.mark.parametrize("value", [0, 0.5, 1, np.float32(0.5), np.int64(1)])

@@ -73,7 +73,7 @@ def test_a_type_checker_in_another_folder_knows_the_types(site: Path, tmp_path: 
     )
     said = _python(site, tmp_path, "-m", "mypy", "--strict", "client.py")
     assert 'Revealed type is "float"' in said, said
-    assert 'Revealed type is "toftrack.camera.Camera"' in said
+    assert 'Revealed type is "toftrack.frames.camera.Camera"' in said
     assert '"Estimate" has no attribute "no_such_field"' in said
 
 

@@ -31,7 +31,7 @@ from hydra.plugins.launcher import Launcher
 
 from toftrack.api import make_device
 from toftrack.devices.replay import Sample
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import json_line
 from toftrack.output.results import ResultWriter

@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from toftrack.api import make_device as make_device
     from toftrack.api import make_hands_tracker as make_hands_tracker
     from toftrack.api import make_tracker as make_tracker
-    from toftrack.camera import Camera as Camera
     from toftrack.devices.base import BaseDevice as BaseDevice
     from toftrack.errors import ToftrackError as ToftrackError
-    from toftrack.estimate import Estimate as Estimate
-    from toftrack.frames import Frame as Frame
+    from toftrack.frames.camera import Camera as Camera
+    from toftrack.frames.estimate import Estimate as Estimate
+    from toftrack.frames.frame import Frame as Frame
     from toftrack.hand.openxr import OPENXR_JOINT_NAMES as OPENXR_JOINT_NAMES
     from toftrack.hand.skeleton import ANGLE_NAMES as ANGLE_NAMES
     from toftrack.hand.skeleton import JOINT_NAMES as JOINT_NAMES
@@ -51,9 +51,9 @@ if TYPE_CHECKING:
 _PLACES = {
     "ANGLE_NAMES": "toftrack.hand.skeleton",
     "BaseDevice": "toftrack.devices.base",
-    "Camera": "toftrack.camera",
-    "Estimate": "toftrack.estimate",
-    "Frame": "toftrack.frames",
+    "Camera": "toftrack.frames.camera",
+    "Estimate": "toftrack.frames.estimate",
+    "Frame": "toftrack.frames.frame",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
     "Run": "toftrack.output.run_folder",

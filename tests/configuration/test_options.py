@@ -19,8 +19,8 @@ from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import DictConfig, OmegaConf
 
 from toftrack.api import build_tracker
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
 from toftrack.pose_space.data.pose_data import synthetic_data

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 T, H, W = 12, 6, 8
 K = np.array([[20.0, 0, 4], [0, 20.0, 3], [0, 0, 1]])

@@ -13,10 +13,10 @@ from helpers.settings import orbbec
 from helpers.tracking import ROOT
 from helpers.videos import RATIONAL
 
-from toftrack.camera import Camera
 from toftrack.devices.orbbec.device import load_sdk
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 CAMERA = Camera(np.array([[252.0, 0, 165], [0, 253, 150], [0, 0, 1]]), 320, 288, RATIONAL)
 COUNT = 10

@@ -15,11 +15,11 @@ from helpers.tracking import ROOT
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 
-from toftrack.camera import Camera
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 FRAMES = 12
 

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from helpers.settings import realsense, realsense_emulator
 
-from toftrack.camera import Camera
 from toftrack.devices.base import Device
 from toftrack.devices.realsense.device import (
     RealSense,
@@ -25,6 +24,7 @@ from toftrack.devices.realsense.device import (
 from toftrack.devices.realsense.emulator import EmulatedCamera
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 FINE = realsense_emulator(fps=500.0, unit_m=0.0001)
 

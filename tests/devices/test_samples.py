@@ -12,10 +12,10 @@ from helpers.tracking import errors_mm, make_tracker, sample
 from helpers.videos import RATIONAL, calibration, seen_through, write_kinect
 
 import toftrack
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Bag, Replay, Sample
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.store import SAMPLES, sample_file
 
 DATA = resources.files("toftrack") / "data"

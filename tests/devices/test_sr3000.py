@@ -17,7 +17,6 @@ from helpers import programs
 from helpers.programs import QUICK, interrupted_when
 from helpers.settings import persistence_settings, sr3000, sr3000_emulator, usb_settings
 
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000 import usb as sr3000_usb
@@ -26,6 +25,7 @@ from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.transport import Exposure
 from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.sr_frame import FRAME_BYTES, unambiguous_range_m
 from toftrack.recordings.store import open_source
 

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from helpers.readers import Reader, write_readers
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.npz import Recording, read_recording, write_recording
 
 hypothesis = pytest.importorskip("hypothesis", reason="hypothesis is not installed")

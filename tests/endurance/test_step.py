@@ -13,7 +13,7 @@ from helpers.tracking import configuration, sample
 
 from toftrack.api import build_model
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, is_vacant
+from toftrack.frames.estimate import Estimate, is_vacant
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.tracker import HandsTracker, Tracker
 

@@ -20,7 +20,7 @@ from toftrack.evaluation.measures import (
     evaluate,
     measured,
 )
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 from toftrack.recordings.npz import read_recording
 
 

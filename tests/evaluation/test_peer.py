@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from helpers.tracking import sample
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import peer, peer_mediapipe
 from toftrack.evaluation.peer import Peer
+from toftrack.frames.camera import Camera
 from toftrack.programs import benchmark
 
 K = np.array([[200.0, 0, 88], [0, 200, 72], [0, 0, 1]])

@@ -18,7 +18,7 @@ from toftrack.evaluation.rows import (
     row_figures,
     totals,
 )
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 
 def tracked(seed: int, name: str = "set/a", frames: int = 60) -> dict:

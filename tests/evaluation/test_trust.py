@@ -18,7 +18,7 @@ from toftrack.evaluation.trust import (
     trust,
     until,
 )
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 J = 21
 

@@ -14,7 +14,7 @@ from helpers.tracking import follow as follow_scene
 from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.gestures.features import features
 from toftrack.gestures.recognition import GestureState, pointing_ray, tell_gesture, update
 from toftrack.hand.shape import default_hand_shape

@@ -10,8 +10,8 @@ import pytest
 from helpers.hands import SIZE_PX, K, hand_estimate, lost_hand
 from helpers.tracking import follow, make_tracker, sample
 
-from toftrack.camera import Camera
-from toftrack.estimate import Estimate
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.conventions import image_landmarks, in_all_conventions
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES

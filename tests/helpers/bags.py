@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
+from toftrack.frames.camera import Camera
 
 DEPTH = "/camera/depth/image_raw"
 INFO = "/camera/depth/camera_info"

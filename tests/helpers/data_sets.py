@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from scipy.io import savemat
 
-from toftrack.camera import Camera
+from toftrack.frames.camera import Camera
 from toftrack.recordings.npz import Recording, read_recording
 
 THUMB_LAST = [0, *range(5, 21), *range(1, 5)]

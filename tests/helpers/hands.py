@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics

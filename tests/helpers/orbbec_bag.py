@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
+from toftrack.frames.camera import Camera
 
 _DEPTH, _INFRARED = 3, 1
 """Numbers of the sensors, their streams and frames."""

@@ -15,7 +15,6 @@ from helpers import bags, videos
 from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
 from helpers.tracking import run
 
-from toftrack.camera import Camera
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration
 from toftrack.detector.network import Finder, PoseNet
@@ -24,6 +23,7 @@ from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save
 from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA, open_data_set
+from toftrack.frames.camera import Camera
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES

@@ -17,7 +17,7 @@ from omegaconf import DictConfig
 from toftrack.api import build_tracker
 from toftrack.devices.base import Device
 from toftrack.devices.replay import Sample
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.programs.track import track
 from toftrack.tracking.tracker import Tracker
 

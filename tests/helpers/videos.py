@@ -12,7 +12,7 @@ import av
 import cv2
 import numpy as np
 
-from toftrack.camera import Camera
+from toftrack.frames.camera import Camera
 
 START_OFFSET_S = 0.5
 """Of the camera's clock in `write_kinect`."""

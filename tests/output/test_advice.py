@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 from toftrack.output.advice import LostFrame, RunFacts, Watch, advice, lost_frame
 
 REACH_M = 1.05

@@ -14,7 +14,7 @@ from helpers.hands import hand_estimate, lost_hand
 from scipy.spatial.transform import Rotation
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES

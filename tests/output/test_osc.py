@@ -12,7 +12,7 @@ from helpers.hands import hand_estimate, lost_hand
 from helpers.settings import part
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import line_content

@@ -18,10 +18,10 @@ import pytest
 from helpers.hands import hand_estimate
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
 from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
-from toftrack.frames import Truth
+from toftrack.frames.estimate import Estimate, no_estimate
+from toftrack.frames.frame import Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, LINE_FIELDS, json_line, read_lines

@@ -9,8 +9,8 @@ import pytest
 from helpers.hands import hand_estimate
 
 import toftrack
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import ResultWriter

@@ -12,7 +12,7 @@ import pytest
 from helpers.hands import hand_estimate
 from helpers.tracking import ROOT
 
-from toftrack.estimate import STATES, no_estimate
+from toftrack.frames.estimate import STATES, no_estimate
 from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, json_line
 
 SCHEMA = json.loads((ROOT / "docs/track_line.schema.json").read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ import torch
 from helpers.tracking import configuration
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.gestures.recognition import pointing_ray
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics

@@ -28,7 +28,7 @@ from helpers.tracking import CONF, ROOT, configuration, run
 
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
+from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
 from toftrack.output.results import read_results
 from toftrack.output.stream import ReaderGoneError
@@ -88,7 +88,7 @@ def test_a_reader_of_standard_output_gets_every_line_as_in_track_jsonl() -> None
 def test_nothing_else_gets_to_standard_output() -> None:
     script = """
 import os
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 from toftrack.output.stream import StdoutStream
 with StdoutStream(None, 25) as stream:
     print("printed")

@@ -13,9 +13,9 @@ from helpers.bags import DEPTH, recording, write_bag
 from helpers.tracking import ROOT
 from helpers.videos import write_grey
 
-from toftrack.camera import Camera
 from toftrack.devices.replay import Folder, Replay, Sample
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.programs import convert, record
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.npz import read_recording

@@ -12,7 +12,7 @@ from helpers.animation import Gltf, read_bvh
 from helpers.hands import hand_estimate, lost_hand
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES

@@ -11,7 +11,7 @@ from helpers.tracking import run
 
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
-from toftrack.frames import Frame
+from toftrack.frames.frame import Frame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 

@@ -24,7 +24,7 @@ from toftrack.devices.realsense.device import load_sdk
 from toftrack.devices.replay import Replay, Sample
 from toftrack.devices.synthetic import Synthetic
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame
+from toftrack.frames.frame import Frame
 from toftrack.programs import command_line, recover
 from toftrack.programs.record import main, record_frames
 from toftrack.recordings.npz import read_recording

@@ -12,10 +12,10 @@ from helpers.hands import hand_estimate
 from omegaconf import OmegaConf
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.files.json_text import read_json
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.json_text import read_json
 from toftrack.output.files import LINES
 from toftrack.output.results import RealTime, ResultWriter, read_results
 from toftrack.programs import export

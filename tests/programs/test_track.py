@@ -24,7 +24,7 @@ from helpers.videos import video_frames
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
-from toftrack.estimate import STATES
+from toftrack.frames.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import read_results

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from toftrack.api import make_device, make_hands_tracker
-from toftrack.camera import Camera
 from toftrack.devices.replay import Folder, Replay
 from toftrack.errors import ToftrackError
-from toftrack.frames import checked_image
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import checked_image
 from toftrack.output.advice import Watch
 from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.recordings.doubts import lens_doubt, times_doubt

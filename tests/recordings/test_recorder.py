@@ -15,10 +15,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 from toftrack.recordings import recorder as module
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.recorder import Recorder

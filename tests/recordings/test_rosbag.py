@@ -26,9 +26,9 @@ from helpers.bags import (
     write_bag,
 )
 
-from toftrack.camera import Camera
 from toftrack.devices.replay import Bag, Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings import ros_messages
 from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.ros_messages import camera_of

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.sr_frame import (
     FRAME_BYTES,

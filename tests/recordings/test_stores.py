@@ -11,8 +11,8 @@ import pytest
 from helpers import bags, videos
 from helpers.damage import damaged
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings import npz
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore

@@ -19,9 +19,9 @@ from helpers.videos import (
     write_kinect,
 )
 
-from toftrack.camera import Camera
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.store import open_recording
 

@@ -26,7 +26,7 @@ import numpy as np
 
 from toftrack.api import make_hands_tracker
 from toftrack.evaluation.trust import joint_errors_mm, judged, slots_of_hands, trust
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 _BEHIND_M = 0.03
 """A joint that lies so far behind the reading there is hidden."""

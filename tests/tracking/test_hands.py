@@ -8,7 +8,7 @@ from helpers.tracking import Scene, configuration, sample
 
 from toftrack.api import build_hands_tracker
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.tracking.tracker import HandsTracker
 
 

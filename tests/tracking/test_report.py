@@ -10,8 +10,8 @@ import pytest
 from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of, track_of, view_of
 
 from toftrack.compute.pace import Spans
-from toftrack.estimate import Estimate
-from toftrack.frames import DepthImage
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import DepthImage
 from toftrack.tracking.confidence import JOINT_FEATURES, Status
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState

@@ -11,7 +11,7 @@ from helpers.configured import f_measure, nearest_surface
 from helpers.detection import detection_of
 from helpers.rendered import EMPTY, SIZE, WALL_M, K, hand_at, image_of, scene_of, track_of
 
-from toftrack.frames import DepthImage
+from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
 from toftrack.render.reference import ReferenceScorer

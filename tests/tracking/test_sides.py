@@ -15,7 +15,7 @@ from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
-from toftrack.frames import DepthImage
+from toftrack.frames.frame import DepthImage
 from toftrack.tracking.sides import (
     body_offset_m,
     changes_side,

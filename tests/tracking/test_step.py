@@ -10,7 +10,7 @@ import pytest
 import torch
 from helpers.tracking import Scene, errors_mm, make_tracker, sample
 
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.tracking.tracker import Tracker
 
 pytestmark = pytest.mark.usefixtures("one_thread")

@@ -10,7 +10,7 @@ import torch
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.render.model_image import model_range_image
 from toftrack.tracking.tracker import Tracker

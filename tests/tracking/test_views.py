@@ -22,7 +22,7 @@ from helpers.rendered import (
 
 from toftrack.compute.pace import Duration
 from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.frames import DepthImage
+from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, with_network_length
 from toftrack.tracking.association import SideDetection

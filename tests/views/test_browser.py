@@ -28,7 +28,7 @@ from helpers.settings import browser_view
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import no_estimate, state_words
+from toftrack.frames.estimate import no_estimate, state_words
 from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView
 from toftrack.views.overlay import CAPTION_PX, draw_tracked

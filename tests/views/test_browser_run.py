@@ -32,7 +32,7 @@ from helpers.settings import browser_view
 from helpers.tracking import ROOT, configuration
 
 from toftrack.devices.replay import Replay, Sample
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView

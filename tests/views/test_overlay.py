@@ -12,11 +12,10 @@ import pytest
 from helpers.moments import one_hand
 from helpers.videos import video_frames
 
-from toftrack.camera import Camera
-from toftrack.checks import MOST_HANDS
-from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, no_estimate
-from toftrack.frames import Frame
+from toftrack.errors import MOST_HANDS, ToftrackError
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import Estimate, no_estimate
+from toftrack.frames.frame import Frame
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views.overlay import (
     CAPTION_PX,

@@ -15,9 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.rigid import BOUNDS, Redraw
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 
 RESAMPLERS = ("systematic", "stratified")
 

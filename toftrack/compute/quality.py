@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-from toftrack.checks import check_number
+from toftrack.errors import check_number
 
 _USED = 0.9
 """Part of the budget that frames may take on average; the rest is for those that take longer."""

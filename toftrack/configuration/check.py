@@ -19,8 +19,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from toftrack.checks import MOST_HANDS, check_number
-from toftrack.errors import ToftrackError
+from toftrack.errors import MOST_HANDS, ToftrackError, check_number
 
 _ABOVE_ZERO = frozenset(
     """

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.rigid import pivot_offset
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
@@ -23,6 +22,7 @@ from toftrack.detector.proposals import (
     start_finding,
     start_pose_network,
 )
+from toftrack.errors import check_number
 from toftrack.hand.overlap import overlap_of_each
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints

@@ -21,7 +21,7 @@ from torch import Tensor
 from toftrack.detector.network import CELLS, JOINTS, REPORTED, SEGMENTS, Finder, Found, PoseNet
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
-from toftrack.safe_files import open_to_read
+from toftrack.files.safe_files import open_to_read
 
 FORMAT = "toftrack-detector-network"
 VERSION = "3"

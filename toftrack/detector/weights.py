@@ -14,10 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from toftrack.archives import read_archive, write_archive
 from toftrack.detector.network import Finder, PoseNet, Residual
 from toftrack.errors import ToftrackError
-from toftrack.json_text import parse_json
+from toftrack.files.archives import read_archive, write_archive
+from toftrack.files.json_text import parse_json
 
 FORMAT = "toftrack-detector"
 VERSION = 1

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Self
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame, Truth
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame, Truth
 
 
 class BaseDevice:

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
 from toftrack.recordings.frame_store import FrameStore

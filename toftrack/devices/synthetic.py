@@ -12,11 +12,11 @@ from collections.abc import Iterator
 import numpy as np
 import torch
 
-from toftrack.camera import Camera
 from toftrack.compute.threads import small_operations
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame, Truth
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame, Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface

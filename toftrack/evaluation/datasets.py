@@ -36,10 +36,10 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.safe_files import open_to_read
+from toftrack.frames.camera import Camera
 from toftrack.recordings.png import read_png
-from toftrack.safe_files import open_to_read
 
 FPS = 30.0
 """Frames a second of all data sets."""

@@ -41,8 +41,8 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.measures import FLAG_COUNTS, flag_counts
 from toftrack.evaluation.statistics import figure, mean_of
 from toftrack.evaluation.trust import OK_MM, TIPS, tips_inset
+from toftrack.files.json_text import read_json
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.json_text import read_json
 
 IMAGE_MEANS = (
     "tips_20_pct",

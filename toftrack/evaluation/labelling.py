@@ -21,11 +21,11 @@ from toftrack.configuration.compose import one_sentence
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import Estimate
 from toftrack.evaluation.image_labels import Points, parsed_labels
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import write_whole
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import FINGERS
-from toftrack.json_text import read_json
-from toftrack.safe_files import write_whole
 
 TIPS = tuple(f"{finger}_tip" for finger in FINGERS)
 LABELLED = (*TIPS, *(f"{finger}_mcp" for finger in FINGERS), "wrist")

@@ -57,7 +57,7 @@ from toftrack.evaluation.trust import (
     trust,
     until,
 )
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 from toftrack.hand.regions import in_region_90
 
 SKIPPED = 5

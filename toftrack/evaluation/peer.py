@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 PEER = "mediapipe"
 SCRIPT = Path(__file__).with_name("peer_mediapipe.py")

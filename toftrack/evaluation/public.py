@@ -21,7 +21,7 @@ from toftrack.evaluation.results import plain, table_of
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 _PERCENT = ("within_pct", "usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
 _COLUMNS = (

@@ -34,8 +34,8 @@ from toftrack.evaluation.rows import (
     totals,
 )
 from toftrack.evaluation.statistics import interval, text_of
-from toftrack.json_text import read_json
-from toftrack.safe_files import write_whole
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import write_whole
 
 FORMAT = "toftrack accuracy 1"
 COMPARED = (*MEANS, "longest_silent", "never_right", "first_right", *IMAGE_MEANS)

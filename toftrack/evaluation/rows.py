@@ -24,7 +24,7 @@ import numpy as np
 from toftrack.evaluation.image_labels import IMAGE_MEANS, tip_figures
 from toftrack.evaluation.measures import FLAG_COUNTS, Measured, MeasuredRecording
 from toftrack.evaluation.statistics import interval, mean_of, rounded
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 Row = dict[str, Any]
 """One recording with one seed: `recording`, `seed`, figures (None: about nothing), `groups`."""

@@ -19,12 +19,12 @@ from tqdm import tqdm
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
 from toftrack.evaluation.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.evaluation.measures import Estimates, measured
 from toftrack.evaluation.peer import PEER, PeerEstimate, peer_process
 from toftrack.evaluation.rows import Row, group_counts, row_figures
-from toftrack.frames import Truth
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import Truth
 from toftrack.recordings.npz import read_recording
 
 SIDES = ("told", "auto")

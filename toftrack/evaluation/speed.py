@@ -25,10 +25,10 @@ from hydra.utils import instantiate
 from torch import Tensor
 
 from toftrack.api import make_device, make_tracker
-from toftrack.camera import Camera
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.results import processor
+from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
 from toftrack.pose_space.files import fit_pose_space
 from toftrack.recordings.store import open_source

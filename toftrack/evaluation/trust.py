@@ -26,7 +26,7 @@ from scipy.optimize import linear_sum_assignment
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.statistics import figure, share_pct
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 TIPS = (4, 8, 12, 16, 20)
 """Rows of the fingertips among the 21 joints."""

@@ -26,11 +26,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import write_whole
 from toftrack.gestures import features
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS
-from toftrack.json_text import read_json
 from toftrack.pose_space.data.pose_files import SLACK_DEGREES, in_radians, named_cells, read_table
-from toftrack.safe_files import write_whole
 
 
 class NamedPose(NamedTuple):

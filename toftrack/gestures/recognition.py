@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.gestures import features
 from toftrack.gestures.definitions import FIST, OTHER, RAY_GESTURES, SETS, Definition
 from toftrack.gestures.files import NamedPose, read_poses

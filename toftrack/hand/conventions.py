@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OpenXRHand, openxr_hand, openxr_rig
 from toftrack.hand.shape import HandShape
 

@@ -21,8 +21,8 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import read_json
-from toftrack.safe_files import write_whole
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import write_whole
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from toftrack.estimate import STATES, Estimate, is_vacant
+from toftrack.frames.estimate import STATES, Estimate, is_vacant
 from toftrack.tracking.state import StepInfo
 
 _INSPECTED_PX = 5000

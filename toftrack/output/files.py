@@ -9,8 +9,14 @@ from pathlib import Path
 from typing import IO
 
 from toftrack.errors import ToftrackError
-from toftrack.json_text import read_json, read_object
-from toftrack.safe_files import check_replaceable, lock, open_in_place, open_to_read, remove_partial
+from toftrack.files.json_text import read_json, read_object
+from toftrack.files.safe_files import (
+    check_replaceable,
+    lock,
+    open_in_place,
+    open_to_read,
+    remove_partial,
+)
 
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""

@@ -15,9 +15,9 @@ from typing import Any, get_type_hints
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.estimate import ArrayOnDemand, Estimate, is_vacant
-from toftrack.json_text import parse_json
-from toftrack.safe_files import open_to_read
+from toftrack.files.json_text import parse_json
+from toftrack.files.safe_files import open_to_read
+from toftrack.frames.estimate import ArrayOnDemand, Estimate, is_vacant
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.errors import ToftrackError, module_of_extra
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import hands_of, line_content

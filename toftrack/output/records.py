@@ -22,8 +22,9 @@ from typing import IO, Any, Self
 import numpy as np
 from tqdm import tqdm
 
-from toftrack.archives import Pieces, write_archive
-from toftrack.estimate import Estimate, is_vacant, no_estimate
+from toftrack.files.archives import Pieces, write_archive
+from toftrack.files.safe_files import open_to_read
+from toftrack.frames.estimate import Estimate, is_vacant, no_estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_PARENTS
 from toftrack.output.lines import (
@@ -33,7 +34,6 @@ from toftrack.output.lines import (
     damaged,
     read_lines,
 )
-from toftrack.safe_files import open_to_read
 
 _PIECE = 256
 """Records that are in memory at a time; a line's numbers take some 10 kB as Python objects."""

@@ -16,12 +16,12 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.archives import read_archive
-from toftrack.checks import MOST_HANDS
-from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
-from toftrack.frames import Truth
-from toftrack.json_text import parse_json, read_json
+from toftrack.errors import MOST_HANDS, ToftrackError
+from toftrack.files.archives import read_archive
+from toftrack.files.json_text import parse_json, read_json
+from toftrack.files.safe_files import write_whole
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import Truth
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
 from toftrack.output.lines import (
     DROPPED,
@@ -33,7 +33,6 @@ from toftrack.output.lines import (
 )
 from toftrack.output.records import Records, facts_for_readers, write_results
 from toftrack.output.summary import run_doubts, run_metrics, summarise
-from toftrack.safe_files import write_whole
 
 _VERSION = 1
 _MOST_HELD = 10_000_000

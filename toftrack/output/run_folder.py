@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.devices.synthetic import Synthetic
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import Estimate
-from toftrack.frames import Truth
+from toftrack.files.json_text import read_json
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import Truth
+from toftrack.frames.help_text import fields_in_help
 from toftrack.hand.shape import HandShape
-from toftrack.help_text import fields_in_help
-from toftrack.json_text import read_json
 from toftrack.output.lines import HAND_FIELDS, KINDS
 from toftrack.output.results import read_results, read_run_facts
 from toftrack.output.summary import shape_file

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from toftrack.checks import check_number
 from toftrack.compute.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-from toftrack.estimate import Estimate
+from toftrack.errors import check_number
+from toftrack.frames.estimate import Estimate
 from toftrack.gestures.recognition import pointing_ray
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics

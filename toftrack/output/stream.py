@@ -17,9 +17,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Self
 
-from toftrack.checks import check_number
-from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import Estimate
+from toftrack.errors import ToftrackError, check_number, reported_errors
+from toftrack.frames.estimate import Estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
 
 _log = logging.getLogger(__name__)

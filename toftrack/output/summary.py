@@ -21,7 +21,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, evaluate, measured
 from toftrack.evaluation.statistics import text_of
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.output.records import Records
 from toftrack.recordings.doubts import times_doubt

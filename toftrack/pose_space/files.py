@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
-from toftrack.archives import read_archive, write_archive
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.archives import read_archive, write_archive
+from toftrack.files.json_text import parse_json
 from toftrack.hand.skeleton import ANGLE_NAMES
-from toftrack.json_text import parse_json
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
 from toftrack.pose_space.kernel import (

@@ -11,10 +11,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from toftrack.checks import MOST_HANDS
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
+from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import plain_parser
-from toftrack.safe_files import write_whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -20,15 +20,15 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from toftrack.calibration import fitting as calibration
-from toftrack.calibration.fitting import DepthFit, DepthPairs, Lens, View
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.safe_files import write_whole
+from toftrack.frames import calibration
+from toftrack.frames.calibration import DepthFit, DepthPairs, Lens, View
+from toftrack.frames.camera import Camera
 from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import open_recording
-from toftrack.safe_files import write_whole
 from toftrack.views.figures import chart
 from toftrack.views.figures.chart import write_figures
 from toftrack.views.pictures import write_picture

@@ -27,9 +27,9 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
-from toftrack.json_text import read_object
+from toftrack.files.json_text import read_object
+from toftrack.files.safe_files import let_links_go, write_whole
 from toftrack.programs import shutdown
-from toftrack.safe_files import let_links_go, write_whole
 
 
 @dataclass

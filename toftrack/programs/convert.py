@@ -18,8 +18,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import write_recording

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_set
 from toftrack.evaluation.public import evaluate, table, totals
+from toftrack.files.safe_files import write_whole
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.safe_files import write_whole
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -19,13 +19,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from toftrack.errors import reported_errors
+from toftrack.files.safe_files import write_whole
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports import HandMotion, glb_of, motions_of
 from toftrack.output.lines import DROPPED
 from toftrack.output.run_folder import Run, read_run
 from toftrack.programs.command_line import plain_parser
-from toftrack.safe_files import write_whole
 
 FORMATS = ("glb", "bvh", "csv")
 

@@ -27,10 +27,10 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import Truth
+from toftrack.files.safe_files import make_folder
+from toftrack.frames.frame import Truth
 from toftrack.output.run_folder import Footage, Run, read_run
 from toftrack.programs.command_line import plain_parser
-from toftrack.safe_files import make_folder
 from toftrack.views.figures.chart import new_figure
 from toftrack.views.figures.runs import (
     course_figure,

@@ -23,13 +23,12 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from toftrack.checks import check_number
 from toftrack.configuration.compose import (
     configuration,
     one_sentence,
 )
 from toftrack.devices.base import Device
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
 from toftrack.evaluation.results import checked_targets
 from toftrack.gestures.recognition import Gestures

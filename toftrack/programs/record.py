@@ -19,12 +19,11 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 from tqdm import tqdm
 
-from toftrack.checks import check_number
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.programs import shutdown
 from toftrack.programs.applications import quoted
 from toftrack.programs.command_line import plain_parser

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 from toftrack.errors import ToftrackError
-from toftrack.frames import Truth
-from toftrack.json_text import read_object
+from toftrack.files.json_text import read_object
+from toftrack.files.safe_files import check_replaceable, remove_partial
+from toftrack.frames.frame import Truth
 from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locked_lines
 from toftrack.output.results import count_frames, finish, read_results, read_run_facts, records_of
 from toftrack.output.run_folder import found_again, open_tracked
@@ -24,7 +25,6 @@ from toftrack.output.summary import metrics_table
 from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.store import open_source
 from toftrack.recordings.unfinished import is_recording, recover_recording
-from toftrack.safe_files import check_replaceable, remove_partial
 from toftrack.views.overlay import VIDEO
 from toftrack.views.video import cut_to_whole
 

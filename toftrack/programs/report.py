@@ -21,8 +21,8 @@ import numpy as np
 import yaml
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import read_json
-from toftrack.safe_files import open_to_read, write_whole
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import open_to_read, write_whole
 from toftrack.views.figures import chart
 
 _FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")

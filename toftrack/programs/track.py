@@ -26,8 +26,8 @@ from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import Estimate, confidence_words, is_vacant
-from toftrack.frames import Frame
+from toftrack.frames.estimate import Estimate, confidence_words, is_vacant
+from toftrack.frames.frame import Frame
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES

@@ -14,11 +14,11 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
+from toftrack.files.safe_files import write_whole
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
 from toftrack.programs.command_line import in_sweep, job_words
-from toftrack.safe_files import write_whole
 from toftrack.views.figures.chart import write_figures
 from toftrack.views.figures.poses import (
     corners_figure,

@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import LARGEST_MEDIAN_M, median_reading
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import LARGEST_MEDIAN_M, median_reading
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 
 MILLIMETRE = 0.001

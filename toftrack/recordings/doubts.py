@@ -11,9 +11,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.frames import median_reading, nearest_reading
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import median_reading, nearest_reading
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import some_images
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import Truth
-from toftrack.safe_files import check_readable
+from toftrack.files.safe_files import check_readable
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Truth
 
 DEFAULT_FPS = 25.0
 

@@ -30,13 +30,19 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.archives import MOST_BYTES, Archive, Header, PickledError, Pieces, write_archive
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Truth, median_reading, wrong_unit
-from toftrack.json_text import parse_json
+from toftrack.files.archives import MOST_BYTES, Archive, Header, PickledError, Pieces, write_archive
+from toftrack.files.json_text import parse_json
+from toftrack.files.safe_files import open_to_read
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import (
+    LARGEST_MEDIAN_M,
+    SMALLEST_MEDIAN_M,
+    Truth,
+    median_reading,
+    wrong_unit,
+)
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
-from toftrack.safe_files import open_to_read
 
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""

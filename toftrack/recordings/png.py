@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.safe_files import open_to_read
+from toftrack.files.safe_files import open_to_read
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _LARGEST_PIXELS = 64_000_000

@@ -23,13 +23,13 @@ from typing import Any, Self
 import cv2
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import read_json
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import open_new, open_to_read, write_whole
+from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, BareFacts, is_positive
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore
 from toftrack.recordings.png import read_png
-from toftrack.safe_files import open_new, open_to_read, write_whole
 
 _CAMERA, _TIMES = "camera.json", "timestamps.txt"
 

@@ -16,9 +16,15 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M, Frame, median_reading, wrong_unit
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import (
+    LARGEST_MEDIAN_M,
+    SMALLEST_MEDIAN_M,
+    Frame,
+    median_reading,
+    wrong_unit,
+)
 from toftrack.recordings.unfinished import (
     IMAGE_TYPES,
     SUFFIX,

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 from toftrack.recordings.png import SIGNATURE, decoded_png
 
 IMAGE = "sensor_msgs/msg/Image"

@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.safe_files import check_readable
+from toftrack.frames.camera import Camera
 from toftrack.recordings.bag_names import storage_of
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, check_metres
 from toftrack.recordings.frame_store import FrameStore, rate_of
@@ -31,7 +32,6 @@ from toftrack.recordings.ros_messages import (
     encoding,
     is_depth,
 )
-from toftrack.safe_files import check_readable
 
 _REPAIR = {
     ".bag": "rosbag reindex FILE repairs a bag that was cut off",

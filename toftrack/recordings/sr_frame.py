@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 WIDTH, HEIGHT = 176, 144
 IMAGE_BYTES = WIDTH * HEIGHT * 2

@@ -26,9 +26,10 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import parse_json
+from toftrack.files.json_text import parse_json
+from toftrack.files.safe_files import open_to_read
+from toftrack.frames.camera import Camera
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
@@ -41,7 +42,6 @@ from toftrack.recordings.sr_frame import (
     unambiguous_range_m,
 )
 from toftrack.recordings.unfinished import GrowingFile
-from toftrack.safe_files import open_to_read
 
 _SIGNATURE, _VERSION = 0x4F497273, 1
 _INIT, _CONFIGURE, _FRAME = 1, 2, 3

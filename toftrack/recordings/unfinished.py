@@ -25,12 +25,12 @@ from typing import IO, Any, BinaryIO, cast
 
 import numpy as np
 
-from toftrack.archives import add_array
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import parse_json
+from toftrack.files.archives import add_array
+from toftrack.files.json_text import parse_json
+from toftrack.files.safe_files import lock, open_in_place, open_new, whole_file
+from toftrack.frames.camera import Camera
 from toftrack.recordings.npz import camera_arrays
-from toftrack.safe_files import lock, open_in_place, open_new, whole_file
 
 SUFFIX = ".part"
 _FIRST_LINE = b"toftrack unfinished recording 1\n"

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.json_text import parse_json
+from toftrack.files.json_text import parse_json
+from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
 from toftrack.recordings.frame_store import FrameStore, file_of, rate_of
 

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
+from toftrack.errors import check_number
 
 # The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
 _JOINTS = [

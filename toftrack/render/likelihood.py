@@ -15,8 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.render.scoring import Counts, Evidence
 from toftrack.render.segmentation import Observation
 

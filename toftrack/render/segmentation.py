@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
+from toftrack.errors import check_number
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""

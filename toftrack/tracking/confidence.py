@@ -18,11 +18,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import Detection
-from toftrack.errors import ToftrackError
-from toftrack.json_text import read_json
+from toftrack.errors import ToftrackError, check_number
+from toftrack.files.json_text import read_json
 from toftrack.render.segmentation import Observation
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from toftrack.compute.particle_filter import FilterSettings, Spread
 from toftrack.compute.quality import Quality
 from toftrack.compute.rigid import bound
 from toftrack.detector.hand_detector import HandDetector
-from toftrack.estimate import no_estimate
+from toftrack.frames.estimate import no_estimate
 from toftrack.gestures.recognition import Gestures
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape

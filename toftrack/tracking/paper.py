@@ -16,14 +16,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.pace import Spans
 from toftrack.compute.particle_filter import Spread, covariance
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
-from toftrack.errors import ToftrackError
-from toftrack.frames import DepthImage
+from toftrack.errors import ToftrackError, check_number
+from toftrack.frames.frame import DepthImage
 from toftrack.hand.regions import joint_axes
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import image_term

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.checks import check_number
 from toftrack.compute.transfer import on_device, on_host
+from toftrack.errors import check_number
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.scoring import Counts, Evidence, Scorer

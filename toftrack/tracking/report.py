@@ -17,8 +17,8 @@ from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S, Spans
 from toftrack.compute.rigid import bound
 from toftrack.compute.transfer import on_device, on_host
-from toftrack.estimate import Estimate, lost_estimate, no_estimate
-from toftrack.frames import DepthImage
+from toftrack.frames.estimate import Estimate, lost_estimate, no_estimate
+from toftrack.frames.frame import DepthImage
 from toftrack.gestures.recognition import tell_gesture
 from toftrack.hand.conventions import in_all_conventions
 from toftrack.hand.shape import HandShape

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import torch
 
-from toftrack.frames import DepthImage
+from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
 from toftrack.tracking.candidates import points_at

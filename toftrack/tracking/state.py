@@ -13,8 +13,8 @@ from torch import Tensor
 from toftrack.compute.pace import Duration, elapsed_s
 from toftrack.detector.hand_detector import Detection
 from toftrack.detector.proposals import Places
-from toftrack.estimate import Estimate
-from toftrack.frames import DepthImage
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import DepthImage
 from toftrack.gestures.recognition import GestureState
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Observation

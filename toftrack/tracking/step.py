@@ -10,8 +10,8 @@ import torch
 
 from toftrack.compute.pace import Spans
 from toftrack.compute.threads import small_operations
-from toftrack.estimate import Estimate
-from toftrack.frames import DepthImage
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import associate, keep_tracks

@@ -10,12 +10,11 @@ from typing import cast
 import numpy as np
 import torch
 
-from toftrack.checks import MOST_HANDS, check_number
 from toftrack.compute.quality import Pace, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
-from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate
-from toftrack.frames import DepthImage, checked_image
+from toftrack.errors import MOST_HANDS, ToftrackError, check_number
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import DepthImage, checked_image
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface

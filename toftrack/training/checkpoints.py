@@ -23,7 +23,7 @@ from toftrack.detector.weights import (
     read_arrays,
 )
 from toftrack.errors import ToftrackError
-from toftrack.safe_files import open_to_read, whole_file
+from toftrack.files.safe_files import open_to_read, whole_file
 
 _SUFFIX = ".checkpoint.pt"
 _STATES = ("network", "averaged", "optimiser")

@@ -19,10 +19,10 @@ from scipy.special import expit
 from tqdm import tqdm
 
 from toftrack.api import make_tracker
-from toftrack.archives import write_archive
 from toftrack.errors import ToftrackError
+from toftrack.files.archives import write_archive
+from toftrack.files.safe_files import write_whole
 from toftrack.hand.regions import REGION_90, joint_axes
-from toftrack.safe_files import write_whole
 from toftrack.tracking.confidence import (
     FEATURES,
     JOINT_FEATURES,

@@ -18,7 +18,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, lateral_errors_mm, read_labels
 from toftrack.evaluation.trust import OK_MM, TIPS
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 
 @dataclass(frozen=True, eq=False)

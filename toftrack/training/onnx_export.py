@@ -37,7 +37,7 @@ from toftrack.detector.onnx_networks import (
 )
 from toftrack.detector.weights import load_weights
 from toftrack.errors import ToftrackError
-from toftrack.safe_files import whole_file
+from toftrack.files.safe_files import whole_file
 from toftrack.training.images import crop_images, wide_images
 from toftrack.training.shapes import shape_bank
 

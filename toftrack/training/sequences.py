@@ -15,8 +15,8 @@ import roma
 import torch
 from torch import Tensor
 
-from toftrack.archives import read_archive, write_archive
 from toftrack.errors import ToftrackError
+from toftrack.files.archives import read_archive, write_archive
 from toftrack.training.dice import Dice
 from toftrack.training.hands import HAND, posed_hands, random_rotations, random_views
 from toftrack.training.images import FURNISHED, furnished, other_hands, random_scenes

@@ -12,9 +12,9 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
-from toftrack.checks import check_number
+from toftrack.errors import check_number
+from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import sweep_job
-from toftrack.safe_files import write_whole
 from toftrack.views.pictures import write_picture
 
 

@@ -8,9 +8,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.camera import Camera
-from toftrack.estimate import Estimate
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import Frame
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.state import StepInfo
 

@@ -13,9 +13,15 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.estimate import Estimate, confidence_words, gesture_words, is_vacant, state_words
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import (
+    Estimate,
+    confidence_words,
+    gesture_words,
+    is_vacant,
+    state_words,
+)
 from toftrack.hand.shape import HandShape
 from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame, View

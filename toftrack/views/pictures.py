@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.safe_files import write_whole
+from toftrack.files.safe_files import write_whole
 
 
 def write_picture(path: Path, picture: np.ndarray) -> None:

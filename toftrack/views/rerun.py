@@ -34,12 +34,12 @@ from scipy.spatial.transform import Rotation
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.estimate import Estimate, gesture_words, is_vacant, state_words
+from toftrack.files.safe_files import open_new
+from toftrack.frames.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
-from toftrack.safe_files import open_new
 from toftrack.tracking.state import StepInfo
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify

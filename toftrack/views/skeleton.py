@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from toftrack.camera import Camera
-from toftrack.estimate import Estimate, is_vacant
+from toftrack.frames.camera import Camera
+from toftrack.frames.estimate import Estimate, is_vacant
 
 # The palette of Okabe and Ito, which colour-blind people can tell apart; thumb to little finger.
 FINGER_RGB = ((230, 159, 0), (86, 180, 233), (0, 158, 115), (240, 228, 66), (204, 121, 167))

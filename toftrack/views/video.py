@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.safe_files import open_in_place, open_new
+from toftrack.files.safe_files import open_in_place, open_new
 
 _OPTIONS = {"preset": "ultrafast", "tune": "zerolatency", "crf": "23"}
 """3 ms and 10 kB for 1056 x 468 pixels; no frame is held back."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from toftrack.api import make_hands_tracker
 from toftrack.evaluation.trust import OK_MM, judged, trust
-from toftrack.frames import Truth
+from toftrack.frames.frame import Truth
 
 _JOINTS = slice(2, None)
 _EDGES = (0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)

@@ -17,7 +17,7 @@ from helpers.settings import part
 from helpers.tracking import make_tracker
 
 from toftrack.devices.replay import Sample
-from toftrack.estimate import Estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.output.lines import json_line
 
 WIDTH_M = 0.5

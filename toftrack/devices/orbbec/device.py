@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.devices.live import (
     BUSY,
     OTHER_FILE,
@@ -28,7 +27,8 @@ from toftrack.devices.live import (
     chosen_serial,
 )
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 
 _PIXELS = ("Y16", "Z16")
 """Formats of depth: 16-bit words."""

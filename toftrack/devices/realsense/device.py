@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.devices.live import OTHER_FILE, SdkCamera, Size, chosen_profile, chosen_serial
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 
 _SUFFIXES = (".bag", ".db3")
 _SLICE_MS = 100  # of waiting, between looks at what else may have happened

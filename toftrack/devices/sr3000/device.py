@@ -16,7 +16,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from toftrack.camera import Camera
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.libmesasr import MesaTransport
@@ -32,7 +31,8 @@ from toftrack.devices.sr3000.transport import (
 )
 from toftrack.devices.sr3000.usb import WHEN_IT_DOES_NOT_ANSWER, UsbTransport
 from toftrack.errors import ToftrackError
-from toftrack.frames import Frame
+from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH, decode_frame, nominal_camera
 from toftrack.recordings.store import open_source
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from toftrack.checks import check_number
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.recordings.sr_frame import MODULATION_CODES, REGISTERS, unambiguous_range_m
 
 

@@ -30,7 +30,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from toftrack.errors import ToftrackError
-from toftrack.json_text import parse_json
+from toftrack.files.json_text import parse_json
 
 _log = logging.getLogger(__name__)
 

@@ -16,8 +16,8 @@ import sys
 from collections.abc import Sequence
 from typing import Any, Self
 
-from toftrack.checks import check_number
-from toftrack.estimate import Estimate
+from toftrack.errors import check_number
+from toftrack.frames.estimate import Estimate
 from toftrack.output.lines import json_line
 from toftrack.output.stream import Stream, known_fields
 from toftrack.output.web.server import ANY_PORT, Client, WebServer

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.archives import read_archive
 from toftrack.hand.shape import default_hand_shape
 from toftrack.pose_space.data.pose_data import PoseData, spread_out
 from toftrack.pose_space.inverse_kinematics import (

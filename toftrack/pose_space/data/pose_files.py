@@ -19,11 +19,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from toftrack.archives import read_archive
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.archives import read_archive
+from toftrack.files.safe_files import open_to_read
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES
 from toftrack.pose_space.data.pose_data import CLIP, PoseData, spread_out
-from toftrack.safe_files import open_to_read
 
 SLACK_DEGREES = 10.0
 """An angle may be so far beyond its joint's limit, and is clamped."""

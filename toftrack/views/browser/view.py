@@ -33,10 +33,9 @@ from typing import Any
 
 import cv2
 
-from toftrack.checks import check_number
 from toftrack.compute.threads import small_operations
-from toftrack.errors import ToftrackError
-from toftrack.estimate import is_vacant, state_words
+from toftrack.errors import ToftrackError, check_number
+from toftrack.frames.estimate import is_vacant, state_words
 from toftrack.output.lines import hand_content, strict
 from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of
 from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand, View

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from toftrack.estimate import confidence_words, state_words
 from toftrack.evaluation.trust import joint_errors_mm
-from toftrack.frames import Truth
+from toftrack.frames.estimate import confidence_words, state_words
+from toftrack.frames.frame import Truth
 from toftrack.output.run_folder import Footage, Run, observe
 from toftrack.pose_space.base import PoseSpace
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from toftrack import json_text
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.files import json_text
+from toftrack.files.json_text import parse_json, read_json
+from toftrack.frames.camera import Camera
 from toftrack.hand.shape import HandShape
-from toftrack.json_text import parse_json, read_json
 
 HOSTILE = {
     "lists": ("[" * 100_000, "nested too deeply"),

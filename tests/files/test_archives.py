@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack import archives
-from toftrack.archives import (
+from toftrack.files import archives
+from toftrack.files.archives import (
     MOST_TEXT_BYTES,
     Archive,
     PickledError,

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
-from toftrack.help_text import fields_in_help
+from toftrack.frames.camera import Camera
+from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02

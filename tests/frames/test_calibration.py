@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
-from toftrack.calibration import fitting as calibration
-from toftrack.calibration.fitting import DepthPairs, View
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames import calibration
+from toftrack.frames.calibration import DepthPairs, View
+from toftrack.frames.camera import Camera
 from toftrack.programs import calibrate, command_line
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsFacts, SrsWriter

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from toftrack.safe_files import open_to_read
+from toftrack.files.safe_files import open_to_read
 
 MOST_BYTES = 2**26
 """No file of JSON here comes near 64 MB."""

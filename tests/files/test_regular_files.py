@@ -9,11 +9,11 @@ import pytest
 from helpers.readers import write_readers
 
 from toftrack.errors import ToftrackError
+from toftrack.files.safe_files import open_to_read
 from toftrack.programs.applications import with_recording
 from toftrack.programs.report import read_runs, report
 from toftrack.recordings.store import open_recording
 from toftrack.recordings.unfinished import recover_recording
-from toftrack.safe_files import open_to_read
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 

@@ -16,9 +16,9 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.help_text import fields_in_help
-from toftrack.json_text import read_json
-from toftrack.safe_files import write_whole
+from toftrack.files.json_text import read_json
+from toftrack.files.safe_files import write_whole
+from toftrack.frames.help_text import fields_in_help
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1

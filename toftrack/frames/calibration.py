@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.polynomial import Polynomial
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 _ORDERS = range(1, 8)
 # Enlargements, tried in turn: the finder wants squares of more than a few pixels, and puts corners

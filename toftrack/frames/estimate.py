@@ -9,7 +9,7 @@ from typing import Any, Self, overload
 
 import numpy as np
 
-from toftrack.help_text import fields_in_help
+from toftrack.frames.help_text import fields_in_help
 
 STATES = {
     "tracking": "tracking",

@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 import pytest
 
-from toftrack.camera import Camera
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 W, H = 176, 144
 K = np.array([[200.0, 0, 88.5], [0, 210.0, 71], [0, 0, 1]])

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from toftrack import safe_files
-from toftrack.safe_files import (
+from toftrack.files import safe_files
+from toftrack.files.safe_files import (
     make_folder,
     open_in_place,
     open_new,

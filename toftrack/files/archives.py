@@ -26,7 +26,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from toftrack.safe_files import open_to_read, whole_file
+from toftrack.files.safe_files import open_to_read, whole_file
 
 MOST_BYTES = 2**30
 """An array of more than a gigabyte is not loaded."""

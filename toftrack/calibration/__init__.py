@@ -1,1 +1,0 @@
-"""A camera calibrated from pictures of a chequerboard: lens and depth."""

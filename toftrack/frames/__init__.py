@@ -1,0 +1,1 @@
+"""What comes in and goes out: the camera, its frames, and what the tracker says of each."""
