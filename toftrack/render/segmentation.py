@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import check_number
+from toftrack.render.numba.median import thinned
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
@@ -192,9 +193,11 @@ def reduce_image(
     factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
     if factor <= 1:
         return np.require(depth_m, np.float32, ("C", "W")), k
-    offset = (factor - 1) // 2
-    filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, np.float32), 3 if factor == 2 else 5)
-    small = filtered[offset::factor, offset::factor]
+    depth_m, offset = np.ascontiguousarray(depth_m, np.float32), (factor - 1) // 2
+    if factor == 2:
+        small = cv2.medianBlur(depth_m, 3)[offset::factor, offset::factor]
+    else:
+        small = thinned(depth_m, factor, offset)
     k = k.copy()
     k[0] /= factor
     k[1] /= factor

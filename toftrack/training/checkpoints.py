@@ -36,7 +36,7 @@ _NEWEST = 0.01
 """Weight of a step in the running means."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Progress:
     """What changes while a network is trained.
 

@@ -1,0 +1,74 @@
+"""The median filter of segmentation.reduce_image, compiled, and only where its result is read."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from toftrack.compute.compiling import entry_point
+
+_SIDE = 5
+"""Rows and columns of the window."""
+
+
+def _exchanges(count: int) -> np.ndarray:
+    """(E, 2) pairs to put in order one after another, so that the median of `count` values stands
+    in the middle: what of Batcher's odd-even merge sort leads there (Knuth, The Art of Computer
+    Programming, volume 3, algorithm 5.2.2M).
+    """
+    found = []
+    p = top = 1 << (count - 1).bit_length() - 1
+    while p > 0:
+        q, r, d = top, 0, p
+        while True:
+            found += [(i, i + d) for i in range(count - d) if i & p == r]
+            if q == p:
+                break
+            d, q, r = q - p, q >> 1, p
+        p >>= 1
+    needed, kept = {count // 2}, []
+    for pair in reversed(found):
+        if needed & set(pair):
+            needed |= set(pair)
+            kept.append(pair)
+    return np.array(kept[::-1])
+
+
+_EXCHANGES = _exchanges(_SIDE * _SIDE)
+
+
+@entry_point
+def _thinned(image, factor, offset, exchanges, out):
+    """See `thinned`; the image has a border of half a window. A row at a time, so that the
+    exchanges are vectorised over its columns.
+    """
+    columns = out.shape[1]
+    values = np.empty((_SIDE * _SIDE, columns), np.float32)
+    for row in range(len(out)):
+        for place in range(_SIDE * _SIDE):
+            line = values[place]
+            source = image[row * factor + offset + place // _SIDE, offset + place % _SIDE :]
+            for column in range(columns):
+                line[column] = source[np.uint64(column) * np.uint64(factor)]
+        for pair in range(len(exchanges)):
+            low, high = values[exchanges[pair, 0]], values[exchanges[pair, 1]]
+            for column in range(columns):
+                a, b = low[column], high[column]
+                low[column] = a if a < b else b
+                high[column] = b if a < b else a
+        for column in range(columns):
+            out[row, column] = values[_SIDE * _SIDE // 2, column]
+
+
+def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
+    """Every `factor`-th pixel from `offset` on of an image filtered by the median of 5 x 5.
+
+    image: (H, W) float32 without NaN; at its edge, the last pixels are repeated. The same as
+    cv2.medianBlur(image, 5)[offset::factor, offset::factor], without the pixels between. On one
+    thread, for meanwhile the networks have the others.
+    """
+    rows, columns = (len(range(offset, size, factor)) for size in image.shape)
+    out, half = np.empty((rows, columns), np.float32), _SIDE // 2
+    bordered = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_REPLICATE)
+    _thinned(bordered, factor, offset, _EXCHANGES, out)
+    return out
