@@ -132,7 +132,7 @@ def build_model(config: DictConfig) -> FilterModel:
         **parts,
         detector=detector.to(device),
         refinement=instantiate(config.refine),
-        weights=instantiate(config.posterior),
+        posterior=instantiate(config.posterior),
     )
 
 

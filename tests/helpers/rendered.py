@@ -107,4 +107,4 @@ def view_of(
     seen = model.segmentation(image.depth_m, image.k, expected)
     term = image_term(seen, fitted, model)
     at = expected.nearest_m
-    return View(track, fitted, seen, at, detection, others, term, model, model.weights.keypoints)
+    return View(track, fitted, seen, at, detection, others, term, model, model.posterior)

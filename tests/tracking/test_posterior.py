@@ -46,9 +46,8 @@ def weighed(seen: View, coverage: float | None = None, **weights: float) -> np.n
     used = posterior_weights(**(NONE | weights))
     seen = replace(
         seen,
-        model=replace(seen.model, weights=used),
         image=replace(seen.image, coverage=coverage),
-        keypoint_weight=used.keypoints,
+        weights=used,
     )
     return seen.log_posterior(poses()).numpy()
 

@@ -30,7 +30,7 @@ from toftrack.errors import ToftrackError
 from toftrack.evaluation.results import processor
 from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
-from toftrack.pose_space.files import fit_pose_space
+from toftrack.pose_space.files import KINDS, fit_pose_space
 from toftrack.recordings.store import open_source
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.scoring import Evidence, Scorer
@@ -39,7 +39,7 @@ from toftrack.tracking.backend import BACK_ENDS, make_scorer
 PARTICLES = (100, 300, 1000, 3000, 10_000)
 BASELINES = {"stepping": 3, "naive": 5}
 """The baselines and how often each is timed."""
-SPACES = ("pca", "kernel_pca", "lle", "isomap")
+SPACES = tuple(KINDS)
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {"default": (), "paper": ("experiment=paper",)}
 PARTS = (
     "rectification",

@@ -63,7 +63,7 @@ POINT_REACH = 0.4
 
 @dataclass(frozen=True)
 class Refinement:
-    """How an estimate is refined; see conf/refine/gauss_newton.yaml for what each does.
+    """How an estimate is refined; the first three: conf/refine/gauss_newton.yaml.
 
     points: seen points that are used at most; those farther than reach_m from the surface are no
         part of the hand.

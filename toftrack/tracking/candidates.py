@@ -23,7 +23,7 @@ from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
 from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
-from toftrack.tracking.posterior import ImageTerm, keypoints_off, touching
+from toftrack.tracking.posterior import ImageTerm, PosteriorWeights, keypoints_off, touching
 from toftrack.tracking.state import Track
 
 _SURELY_PRESENT = 0.97
@@ -62,8 +62,9 @@ class View:
 
     fitted: the hand in the applied shape.  observation: not empty.
     expected_m: the depth of its nearest joint, as predicted, or as detected where it (re)starts.
-    detection: empty where the pose network did not look.  keypoint_weight: of its keypoints.
+    detection: empty where the pose network did not look.
     others: joints (21, 3) m of each other hand.  image: the likelihood of the image.
+    weights: of the posterior's terms.
     """
 
     track: Track
@@ -74,7 +75,7 @@ class View:
     others: tuple[Tensor, ...]
     image: ImageTerm
     model: TrackerModel
-    keypoint_weight: float
+    weights: PosteriorWeights
 
     @cached_property
     def hidden(self) -> bool:
@@ -110,10 +111,10 @@ class View:
 
     def log_posterior(self, poses: Tensor) -> Tensor:
         """(N,) log posteriors of poses (N, 27), see posterior.py."""
-        weights, total = self.model.weights, self.image(poses)
+        weights, total = self.weights, self.image(poses)
         joints = self.fitted.refiner.joints(poses)
-        if self.keypoint_weight and not self.detection.empty:
-            total = total - self.keypoint_weight * keypoints_off(joints, self.keypoints)
+        if weights.keypoints and not self.detection.empty:
+            total = total - weights.keypoints * keypoints_off(joints, self.keypoints)
         if weights.overlap:
             length_m = self.fitted.shape.hand_length_m
             total = total - weights.overlap * finger_overlap(joints, length_m)

@@ -179,7 +179,7 @@ class FilterModel:
 class TrackerModel(FilterModel):
     """The parts of the tracker with networks.
 
-    weights: of the terms of the posterior.
+    posterior: the weights of its terms.
     lost: when an estimate is lost, and when its track ends.
     """
 
@@ -187,7 +187,7 @@ class TrackerModel(FilterModel):
 
     detector: HandDetector
     refinement: Refinement
-    weights: PosteriorWeights
+    posterior: PosteriorWeights
     lost: ConfidenceModel
 
     def at_quality(self, quality: Quality) -> TrackerModel:

@@ -1,6 +1,7 @@
 """The report of a frame: which track is in which slot, and the estimate of each.
 
-Only here it matters what the user asked for: how many hands, and of which side.
+Only here tracks are put into slots. How many slots there are, and which side the user told, also
+steer where the networks look (detect.py) and how sides are found out (sides.py).
 """
 
 from __future__ import annotations

@@ -116,9 +116,8 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     fitted = view.model.hand(side, view.track.shape)
     # Very different poses are compared: what explains more of the image counts in full.
     image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
-    seen = replace(
-        view, fitted=fitted, detection=detection, image=image, keypoint_weight=_KEYPOINTS
-    )
+    weights = replace(view.weights, keypoints=_KEYPOINTS)
+    seen = replace(view, fitted=fitted, detection=detection, image=image, weights=weights)
     return max(best_start(seen)[1], WORST)
 
 

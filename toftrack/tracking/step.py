@@ -49,7 +49,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     3. Associate detections with tracks; the unassigned ones begin tentative tracks.
     4. Filter: resample, diffuse and weigh all tracks' particles (B, N, 6 + d) by the F-measure of
        the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
-    5. Refine a few hypotheses (M, 27) by Levenberg-Marquardt steps; the best posterior is the pose.
+    5. Refine a few hypotheses (M, 27) by Gauss-Newton steps; the best posterior is the pose.
     6. Judge it, learn the hand's shape, end tracks that stay doubtful or share another one's hand.
     7. Report the tracks in the slots that the user asked for.
     """

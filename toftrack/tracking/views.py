@@ -116,7 +116,7 @@ def make_view(
         scene.others_joints(row),
         image_term(observation, fitted, model),
         model,
-        model.weights.keypoints,
+        model.posterior,
     )
 
 
