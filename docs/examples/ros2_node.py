@@ -1,6 +1,7 @@
 """A ROS 2 node that follows a hand: `python3 ros2_node.py --ros-args
--r depth:=/camera/depth/image_rect_raw -r camera_info:=/camera/depth/camera_info`. It takes rectified depth images, 16UC1 in mm or 32FC1
-in m. While the hand is not lost it publishes `hand/joints` (PoseArray) and `hand/gesture` (String).
+-r depth:=/camera/depth/image_rect_raw -r camera_info:=/camera/depth/camera_info`. It takes
+rectified depth images, 16UC1 in mm or 32FC1 in m. While the hand is not lost it publishes
+`hand/joints` (PoseArray) and `hand/gesture` (String).
 """
 
 from __future__ import annotations

@@ -40,7 +40,6 @@ class PushDevice(BaseDevice):
         self._ended = True
 
     def __iter__(self) -> Iterator[Frame]:
-        self.dropped = 0
         while not (self._ended and self._newest.empty()):
             with suppress(queue.Empty):
                 yield self._newest.get(timeout=_LOOK_S)

@@ -30,7 +30,6 @@ from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.stream import ReaderGoneError
 from toftrack.programs.applications import with_recording
 from toftrack.programs.export import csv_of, table_of
-from toftrack.views.base import TrackedFrame
 
 if TYPE_CHECKING:
     import pandas
@@ -80,8 +79,7 @@ class Tracking:
         """(H, W) float32 metres, 0 = no reading: the rectified image of the newest estimate."""
 
     def __iter__(self) -> Iterator[Estimate]:
-        for tracked, smoothed in self._frames():
-            self.depth_m = tracked.depth_m
+        for _, smoothed in self._frames():
             yield from smoothed
 
     def results(self) -> Results:
@@ -94,14 +92,15 @@ class Tracking:
                 raise ToftrackError("the device delivered no frame; nothing was tracked")
             with ResultWriter(folder, self._metadata, JOINT_NAMES) as writer:
                 try:
-                    for tracked, _ in chain((first,), frames):
-                        writer.append(tracked.estimates)
+                    for estimates, _ in chain((first,), frames):
+                        writer.append(estimates)
                 except KeyboardInterrupt:
                     if not self.device.live:
                         raise
             return Results(read_results(Path(folder) / "track.npz"))
 
-    def _frames(self) -> Iterator[tuple[TrackedFrame, tuple[Estimate, ...]]]:
+    def _frames(self) -> Iterator[tuple[tuple[Estimate, ...], tuple[Estimate, ...]]]:
+        """Of each frame the estimates, and smoothed."""
         from toftrack.programs.track import prepared_run, run_metadata  # takes seconds
 
         config, device = self._config, self.device
@@ -110,7 +109,9 @@ class Tracking:
             make_view = instantiate(config.view, _partial_=True)
             with make_view(folder=Path(), fps=device.fps, frames=device.frames) as view:
                 for frame in device:
-                    yield run.frame(frame, time.perf_counter(), view)
+                    tracked, smoothed = run.frame(frame, time.perf_counter(), view)
+                    self.depth_m = tracked.depth_m
+                    yield tracked.estimates, smoothed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
