@@ -76,7 +76,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
             "frame 30, 1.200 s: right hand, wrist at -0.020 0.080 0.500 m, 90 % sure, palm",
         ),
         (
-            hand_estimate(0, gesture="", side=""),
+            hand_estimate(0).updated(gesture="", side=""),
             "frame 0, 0.000 s: hand, wrist at -0.050 0.080 0.500 m, 90 % sure",
         ),
         (

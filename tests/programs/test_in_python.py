@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -100,11 +101,15 @@ def test_results_are_drawn_on_the_image_of_their_frame(
     assert np.array_equal(picture, both) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_results_become_a_table_of_pandas(results: toftrack.Results) -> None:
-    try:
-        table = results.to_pandas()
-    except toftrack.ToftrackError as error:
-        pytest.skip(str(error))
+def test_results_become_a_table_of_pandas(
+    results: toftrack.Results, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        with pytest.raises(toftrack.ToftrackError, match="needs the package pandas.*pip install"):
+            results.to_pandas()
+    pytest.importorskip("pandas", reason="pip install '.[pandas]'")
+    table = results.to_pandas()
     assert table["index"].tolist() == [0, 0, 1, 1, 2, 2] and table["lost"].dtype == bool
     assert np.allclose(table["wrist_z_m"], results.joints_m[..., 0, 2].ravel())
 

@@ -6,7 +6,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from itertools import chain
@@ -24,9 +24,9 @@ from toftrack.files.archives import write_archive
 from toftrack.files.safe_files import write_whole
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.lines import HAND_FIELDS, KINDS, json_line
+from toftrack.output.lines import KINDS, json_line
 from toftrack.output.records import facts_for_readers
-from toftrack.output.results import ResultWriter, read_results
+from toftrack.output.results import ResultWriter, estimates_of, read_results
 from toftrack.output.stream import ReaderGoneError
 from toftrack.programs.applications import with_recording
 from toftrack.programs.export import csv_of, table_of
@@ -99,7 +99,7 @@ class Tracking:
                         raise
             return Results(read_results(Path(folder) / "track.npz"))
 
-    def _frames(self) -> Iterator[tuple[tuple[Estimate, ...], tuple[Estimate, ...]]]:
+    def _frames(self) -> Generator[tuple[tuple[Estimate, ...], tuple[Estimate, ...]]]:
         """Of each frame the estimates, and smoothed."""
         from toftrack.programs.track import prepared_run, run_metadata  # takes seconds
 
@@ -139,12 +139,7 @@ class Results:
 
     def estimates(self, row: int) -> tuple[Estimate, ...]:
         """Those of a row's frame, one a slot."""
-        found = []
-        for slot in np.ndindex(self.lost.shape[1:]):
-            places = {name: (row, *slot) if name in HAND_FIELDS else row for name in KINDS}
-            values = {name: self.content[name][place] for name, place in places.items()}
-            found.append(Estimate(**{k: v if v.ndim else v.item() for k, v in values.items()}))
-        return tuple(found)
+        return estimates_of(self.content, row)
 
     def draw(self, image: np.ndarray, row: int) -> np.ndarray:
         """The image of a row's frame with the skeletons; see `toftrack.draw`."""
@@ -165,8 +160,8 @@ class Results:
             elif path.suffix == ".csv":
                 write_whole(path, csv_of(content))
             elif path.suffix == ".jsonl":
-                lines = (json_line(self.estimates(row)) for row in np.flatnonzero(~self.dropped))
-                write_whole(path, "".join(f"{line}\n" for line in lines))
+                rows = np.flatnonzero(~self.dropped).tolist()
+                write_whole(path, "".join(f"{json_line(self.estimates(row))}\n" for row in rows))
             else:
                 raise ToftrackError(f"'{path}' ends in none of .npz, .jsonl and .csv; let it")
 
