@@ -86,7 +86,7 @@ def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_pa
         rows = list(csv.DictReader(stream))
     assert [(row["index"], row["slot"]) for row in rows][-2:] == [("2", "0"), ("2", "1")]
     for name, words in (
-        ("hand.txt", "none of .npz, .jsonl and .csv"),
+        ("hand.txt", "end in .npz, .jsonl or .csv"),
         ("a/b.csv", "cannot be written"),
     ):
         with pytest.raises(toftrack.ToftrackError, match=words):

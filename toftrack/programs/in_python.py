@@ -74,9 +74,9 @@ class Tracking:
 
     def __init__(self, config: DictConfig, device: BaseDevice) -> None:
         self._config, self.device = config, device
-        self.camera, self._metadata = device.camera, dict[str, Any]()
-        self.depth_m = np.zeros((device.camera.height, device.camera.width), np.float32)
-        """(H, W) float32 metres, 0 = no reading: the rectified image of the newest estimate."""
+        self._metadata: dict[str, Any] = {}
+        self.camera, self.depth_m = device.camera, np.zeros((0, 0), np.float32)
+        """Of the newest estimate; (H, W) metres, 0 = no reading: its rectified image."""
 
     def __iter__(self) -> Iterator[Estimate]:
         for _, smoothed in self._frames():
@@ -110,7 +110,7 @@ class Tracking:
             with make_view(folder=Path(), fps=device.fps, frames=device.frames) as view:
                 for frame in device:
                     tracked, smoothed = run.frame(frame, time.perf_counter(), view)
-                    self.depth_m = tracked.depth_m
+                    self.camera, self.depth_m = tracked.camera, tracked.depth_m
                     yield tracked.estimates, smoothed
 
 
@@ -163,7 +163,7 @@ class Results:
                 rows = np.flatnonzero(~self.dropped).tolist()
                 write_whole(path, "".join(f"{json_line(self.estimates(row))}\n" for row in rows))
             else:
-                raise ToftrackError(f"'{path}' ends in none of .npz, .jsonl and .csv; let it")
+                raise ToftrackError(f"'{path}' names no format; let it end in .npz, .jsonl or .csv")
 
     def to_pandas(self) -> pandas.DataFrame:
         """The table of .csv files. Raises ToftrackError where pandas is not installed."""
