@@ -14,6 +14,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
+from helpers.hands import hand_estimate, lost_hand
 from helpers.tracking import sample
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -65,6 +66,29 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
         *("side", "side_probability", "joint_sigma_m", "joint_confidence", "joint_ok"),
         *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),
     }
+
+
+@pytest.mark.parametrize(
+    ("estimate", "said"),
+    [
+        (
+            hand_estimate(30),
+            "frame 30, 1.200 s: right hand, wrist at -0.020 0.080 0.500 m, 90 % sure, palm",
+        ),
+        (
+            hand_estimate(0).updated(gesture="", side=""),
+            "frame 0, 0.000 s: hand, wrist at -0.050 0.080 0.500 m, 90 % sure",
+        ),
+        (
+            hand_estimate(1, pinching=True, joint_ok=np.arange(21) > 1),
+            "palm, pinching, 2 joints not ok",
+        ),
+        (lost_hand(2), "frame 2, 0.080 s: lost, no hand found"),
+        (hand_estimate(3, lost=True), "frame 3, 0.120 s: lost, not sure of the pose"),
+    ],
+)
+def test_an_estimate_prints_itself_in_a_line(estimate: toftrack.Estimate, said: str) -> None:
+    assert f"{estimate}".endswith(f"{said}>") and repr(estimate) == str(estimate)
 
 
 def test_three_lines_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

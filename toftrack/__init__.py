@@ -4,6 +4,11 @@ For a program of one's own:
 
     import toftrack
 
+    for estimate in toftrack.track("hand.npz", "hands=2"):
+        print(estimate)
+
+or, of images of one's own:
+
     tracker = toftrack.make_tracker("hand.side=left")
     estimate = tracker.step(depth_m, K)
     estimate.joints_m
@@ -31,6 +36,7 @@ if TYPE_CHECKING:
     from toftrack.api import make_hands_tracker as make_hands_tracker
     from toftrack.api import make_tracker as make_tracker
     from toftrack.devices.base import BaseDevice as BaseDevice
+    from toftrack.devices.pushed import PushDevice as PushDevice
     from toftrack.errors import ToftrackError as ToftrackError
     from toftrack.frames.camera import Camera as Camera
     from toftrack.frames.estimate import Estimate as Estimate
@@ -41,6 +47,9 @@ if TYPE_CHECKING:
     from toftrack.output.results import read_results as read_results
     from toftrack.output.run_folder import Run as Run
     from toftrack.output.run_folder import read_run as read_run
+    from toftrack.programs.in_python import Results as Results
+    from toftrack.programs.in_python import Tracking as Tracking
+    from toftrack.programs.in_python import track as track
     from toftrack.tracking.tracker import HandsTracker as HandsTracker
     from toftrack.tracking.tracker import Tracker as Tracker
     from toftrack.views.overlay import draw as draw
@@ -56,16 +65,20 @@ _PLACES = {
     "Frame": "toftrack.frames.frame",
     "JOINT_NAMES": "toftrack.hand.skeleton",
     "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
+    "PushDevice": "toftrack.devices.pushed",
+    "Results": "toftrack.programs.in_python",
     "Run": "toftrack.output.run_folder",
     "ToftrackError": "toftrack.errors",
     "HandsTracker": "toftrack.tracking.tracker",
     "Tracker": "toftrack.tracking.tracker",
+    "Tracking": "toftrack.programs.in_python",
     "draw": "toftrack.views.overlay",
     "make_device": "toftrack.api",
     "make_hands_tracker": "toftrack.api",
     "make_tracker": "toftrack.api",
     "read_results": "toftrack.output.results",
     "read_run": "toftrack.output.run_folder",
+    "track": "toftrack.programs.in_python",
 }
 
 __all__ = sorted((*_PLACES, "__version__"))

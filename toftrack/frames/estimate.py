@@ -125,6 +125,17 @@ class Estimate:
     openxr_radius_m: ArrayOnDemand = ArrayOnDemand(26)
     """(26,) metres from these joints to the skin."""
 
+    def __repr__(self) -> str:
+        """<frame 30, 1.200 s: right hand, wrist at 0.012 -0.034 0.512 m, 97 % sure, palm>"""
+        words = ["lost", state_words(self)]
+        if not self.lost:
+            place = " ".join(f"{value:.3f}" for value in self.joints_m[0])
+            bad = int((~self.joint_ok).sum())
+            words = [f"{self.side} hand, wrist at {place} m".strip()]
+            words += [confidence_words(self.confidence), gesture_words(self)]
+            words += [f"{bad} joints not ok"] if bad else []
+        return f"<frame {self.index}, {self.timestamp_s:.3f} s: {', '.join(filter(None, words))}>"
+
     def updated(self, **changes: Any) -> Self:
         """With other values of some fields, as dataclasses.replace; what is on demand stays so."""
         made = object.__new__(type(self))

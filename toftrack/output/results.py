@@ -250,6 +250,16 @@ def read_results(path: str | Path) -> dict[str, Any]:
     return content
 
 
+def estimates_of(results: dict[str, Any], row: int) -> tuple[Estimate, ...]:
+    """What the tracker said about one frame of `read_results`, one a slot."""
+    found = []
+    for slot in np.ndindex(results["lost"].shape[1:]):
+        places = {name: (row, *slot) if name in HAND_FIELDS else row for name in KINDS}
+        values = {name: results[name][place] for name, place in places.items()}
+        found.append(Estimate(**{k: v if v.ndim else v.item() for k, v in values.items()}))
+    return tuple(found)
+
+
 def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
     """ValueError where arrays are not of as many frames and slots, or not of the types, that a
     track.npz has.

@@ -17,8 +17,8 @@ from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
 from toftrack.frames.help_text import fields_in_help
 from toftrack.hand.shape import HandShape
-from toftrack.output.lines import HAND_FIELDS, KINDS
-from toftrack.output.results import read_results, read_run_facts
+from toftrack.output.lines import HAND_FIELDS
+from toftrack.output.results import estimates_of, read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
@@ -119,15 +119,11 @@ class Run:
 
     def estimates(self, row: int) -> tuple[Estimate, ...]:
         """What the tracker said about one frame, one a slot."""
-        return tuple(self.slot(number).estimate(row) for number in range(len(self.shapes)))
+        return estimates_of(self.results, row)
 
     def estimate(self, row: int) -> Estimate:
         """What the tracker said about one frame of a run with one slot, see `slot`."""
-        values = {name: self.results[name][row] for name in KINDS}
-        for name, value in values.items():
-            if np.ndim(value) == 0:
-                values[name] = value.item()
-        return Estimate(**values)
+        return self.estimates(row)[0]
 
     def likelihood(self) -> FMeasure:
         """The run's likelihood; ToftrackError when it is none that this program knows."""

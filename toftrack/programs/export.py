@@ -126,11 +126,15 @@ def csv_of(results: Mapping[str, Any]) -> str:
     """
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerows(_rows(results))
+    rows = table_of(results)
+    table.writerow(next(rows))
+    for number, time_s, *values in rows:
+        table.writerow([number, f"{time_s:.6f}", *map(_cell, values)])
     return text.getvalue()
 
 
-def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
+def table_of(results: Mapping[str, Any]) -> Iterator[list[Any]]:
+    """The titles of `csv_of`, and then its rows, with their values as they are."""
     several = np.ndim(results["lost"]) > 1
     slots = np.shape(results["lost"])[1] if several else 1
     joints = results["joint_names"]
@@ -147,12 +151,13 @@ def _rows(results: Mapping[str, Any]) -> Iterator[list[Any]]:
     index = results.get("index", np.arange(len(results["lost"])))
     for row, number in enumerate(index):
         for slot in range(slots):
-            cells = [number, f"{results['timestamp_s'][row]:.6f}", *([slot] if several else [])]
+            time_s = float(results["timestamp_s"][row])
+            cells = [int(number), time_s, *([slot] if several else [])]
             for name, array in arrays.items():
                 # A frame is dropped for all of its hands.
                 here = (row, slot) if several and name != DROPPED else row
                 cells += array[here].ravel().tolist()[-len(titles[name]) :]
-            yield [_cell(value) for value in cells]
+            yield cells
 
 
 def _cell(value: Any) -> str:

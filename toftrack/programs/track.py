@@ -7,9 +7,9 @@ import math
 import platform
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import AbstractContextManager, nullcontext, suppress
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from dataclasses import dataclass
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -53,6 +53,17 @@ def track(config: DictConfig, device: Device) -> float:
     program is obeyed between two frames; then everything is finished before it is passed on.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
+    with prepared_run(config, device) as run:
+        try:
+            return _track(config, folder, run)
+        finally:  # a live run that lost the hand ends by an interruption
+            for sentence in run.notes():
+                _note(sentence)
+
+
+@contextmanager
+def prepared_run(config: DictConfig, device: Device) -> Iterator[Run]:
+    """What works in the loop of a configuration; `device` is what it describes, not yet open."""
     # Both tell at once what is wrong with them.
     with _recorder(config, device) as recorder, instantiate(config.stream) as stream:
         tracker = build_hands_tracker(config)
@@ -61,7 +72,7 @@ def track(config: DictConfig, device: Device) -> float:
         elif tracker.time.pace.budget_s is None:
             tracker.time.pace = Pace(1 / device.fps)
         reach_m = float(config.segmentation.get("max_distance_m", math.inf))
-        run = _Run(
+        run = Run(
             device,
             tracker,
             recorder,
@@ -69,12 +80,11 @@ def track(config: DictConfig, device: Device) -> float:
             smoothing=instantiate(config.smooth),
             watch=Watch(reach_m, len(tracker.states)),
             realtime=RealTime(device.fps),
+            smoothed=[None] * len(tracker.states),
         )
-        try:
-            return _track(config, folder, run)
-        finally:  # a live run that lost the hand ends by an interruption
-            for sentence in run.notes():
-                _note(sentence)
+        if device.live:
+            tracker.prepare()  # a camera does not wait for what is loaded at the first frame
+        yield run
 
 
 def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Recorder | None]:
@@ -84,13 +94,11 @@ def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Reco
     return Recorder(str(config.record), device, config.record_limit_gb, tell=_log.warning)
 
 
-def _track(config: DictConfig, folder: Path, run: _Run) -> float:
+def _track(config: DictConfig, folder: Path, run: Run) -> float:
     device, tracker = run.device, run.tracker
     ended: KeyboardInterrupt | None = None
-    if device.live:
-        tracker.prepare()  # a camera does not wait for what is loaded at the first frame
     with device:
-        metadata = _metadata(config, device, tracker)
+        metadata = run_metadata(config, device, tracker)
         if not in_sweep():
             print(_opening(metadata, device), file=sys.stderr)
         # It is the first to write into the folder, which it refuses to share with another run.
@@ -116,7 +124,7 @@ def _track(config: DictConfig, folder: Path, run: _Run) -> float:
 
 
 @dataclass(eq=False)
-class _Run:
+class Run:
     """The loop over all frames, and what works in it."""
 
     device: Device
@@ -127,7 +135,7 @@ class _Run:
     watch: Watch
     realtime: RealTime
     """As of the newest frame; of a recording nothing."""
-    smoothed: list[SmoothState | None] = field(default_factory=list)
+    smoothed: list[SmoothState | None]
 
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the run at its end."""
@@ -137,8 +145,12 @@ class _Run:
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:
         """All frames, and the results' files; the view may stay after that."""
-        self.smoothed = [None] * len(self.tracker.states)
         shapes = _ShapeFiles(folder, self.tracker)
+
+        def keep(estimates: tuple[Estimate, ...]) -> None:
+            results.append(estimates)
+            shapes.save()
+
         progress = partial(
             tqdm, total=self.device.frames, unit=" frames", file=sys.stderr, mininterval=0.2
         )
@@ -149,9 +161,9 @@ class _Run:
                 for frame in self.device:
                     began_s = time.perf_counter()
                     with shutdown.not_now():
-                        estimates = self._frame(frame, began_s, results, view, shapes)
+                        tracked, _ = self.frame(frame, began_s, view, keep)
                         bar.update()
-                        bar.set_postfix_str(self._progress(estimates), refresh=False)
+                        bar.set_postfix_str(self._progress(tracked.estimates), refresh=False)
         except ReaderGoneError as gone:
             print(f"{gone}: tracking ends here", file=sys.stderr)
         finally:
@@ -165,14 +177,14 @@ class _Run:
                     if self.recorder is not None:
                         self.recorder.close()
 
-    def _frame(
+    def frame(
         self,
         frame: Frame,
         began_s: float,
-        results: ResultWriter,
         view: View,
-        shape_files: _ShapeFiles,
-    ) -> tuple[Estimate, ...]:
+        keep: Callable[[tuple[Estimate, ...]], None] = lambda estimates: None,
+    ) -> tuple[TrackedFrame, tuple[Estimate, ...]]:
+        """Track a frame, keep, send and show it; returns it, and the estimates as they are sent."""
         device, tracker = self.device, self.tracker
         if self.recorder is not None:  # first: whatever it may do to the tracker
             self.recorder.put(frame, wait=not device.live)
@@ -190,17 +202,17 @@ class _Run:
         calm = tuple(self._calm(estimates, shapes, depth))
         if self.smoothing is not None and self.smoothing.results:
             estimates = calm
-        results.append(estimates)
-        shape_files.save()
+        keep(estimates)
         self.stream.send(calm)
         hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
         told = self._told()
         advice = self.watch.advice(told, recent=True)
-        view.show(TrackedFrame(frame, depth, device.camera, hands, told is not None, advice))
+        tracked = TrackedFrame(frame, depth, device.camera, hands, told is not None, advice)
+        view.show(tracked)
         if device.live:
             took_s, reduced = tracker.time.took_s(), tracker.time.reduced
             self.realtime.add(frame.timestamp_s, took_s, reduced, device.dropped)
-        return estimates
+        return tracked, calm
 
     def _calm(
         self, estimates: tuple[Estimate, ...], shapes: tuple[HandShape, ...], depth_m: np.ndarray
@@ -251,7 +263,7 @@ def _note(sentence: str) -> None:
         shutdown.say(f"note: {sentence}", sys.stderr)
 
 
-def _metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
+def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
     """Of run.json and track.npz, JSON-able.
 
     The hand's shape is the first slot's at the start, its side 'auto' where either hand may come.

@@ -1,0 +1,174 @@
+"""toftrack.track: the estimates and results of a recording or device in a program of one's own."""
+
+from __future__ import annotations
+
+import csv
+import json
+import socket
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.programs import QUICK
+from helpers.tracking import run, sample
+
+import toftrack
+from toftrack.devices.replay import Sample
+
+PAPER = ("experiment=paper", *QUICK)  # whose tracker is there at once
+WORDS = ("device.name=two_hands", "hands=2", *QUICK)
+
+
+@pytest.fixture(scope="module")
+def tracking() -> toftrack.Tracking:
+    return toftrack.track("device=sample", "device.stop=3", *WORDS)
+
+
+@pytest.fixture(scope="module")
+def results(tracking: toftrack.Tracking) -> toftrack.Results:
+    return tracking.results()
+
+
+class Camera(toftrack.BaseDevice):
+    """The sample's frames; `fails` after two of them."""
+
+    def __init__(self, fails: type[BaseException] | None = None, live: bool = False) -> None:
+        self.sample, self.fails, self.opened = Sample(stop=4), fails, 0
+        super().__init__(self.sample.camera, self.sample.fps, live=live)
+
+    def open(self) -> None:
+        self.opened += 1
+
+    def close(self) -> None:
+        self.opened -= 1
+
+    def __iter__(self) -> Iterator[toftrack.Frame]:
+        for frame in self.sample:
+            if self.fails and frame.index == 2:
+                raise self.fails("the camera was unplugged")
+            yield frame
+
+
+def test_the_estimates_and_results_are_those_of_the_command_line(
+    tracking: toftrack.Tracking, results: toftrack.Results, tmp_path: Path
+) -> None:
+    run(tmp_path, Sample("two_hands", stop=3), "view=none", *WORDS)
+    of_run = toftrack.read_results(tmp_path / "track.npz")
+    estimates = list(tracking)
+    assert [estimate.index for estimate in estimates] == [0, 0, 1, 1, 2, 2]
+    for name in ("joints_m", "lost", "side", "covariance", "openxr_position_m"):
+        values = [np.asarray(getattr(one, name), of_run[name].dtype) for one in estimates]
+        assert np.array_equal(getattr(results, name), of_run[name], equal_nan=name == "covariance")
+        assert np.array_equal(np.array(values).reshape(of_run[name].shape), of_run[name])
+    again = results.estimates(-1)[1]
+    assert (again.side, again.confidence) == (
+        estimates[-1].side,
+        np.float32(estimates[-1].confidence),
+    )
+    assert str(results) == "<Results: 3 frames, 2 slots, 0% lost>" and "joints_m" in dir(results)
+    with pytest.raises(AttributeError, match="no array 'joint_m'; it has index, .*joints_m"):
+        _ = results.joint_m
+
+
+def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_path: Path) -> None:
+    for kind in ("npz", "jsonl", "csv"):
+        results.save(tmp_path / f"hand.{kind}")
+    with np.load(tmp_path / "hand.npz") as content:
+        assert {"K", "image_size_px", "readme", "angle_names"} <= set(content.files)
+    again = toftrack.Results(toftrack.read_results(tmp_path / "hand.npz"))
+    assert np.array_equal(again.joints_m, results.joints_m)
+    assert again.content["metadata"] == results.content["metadata"]
+    lines = [json.loads(line) for line in (tmp_path / "hand.jsonl").read_text().splitlines()]
+    assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[0, 1]] * 3
+    with (tmp_path / "hand.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    assert [(row["index"], row["slot"]) for row in rows][-2:] == [("2", "0"), ("2", "1")]
+    for name, words in (
+        ("hand.txt", "end in .npz, .jsonl or .csv"),
+        ("a/b.csv", "cannot be written"),
+    ):
+        with pytest.raises(toftrack.ToftrackError, match=words):
+            results.save(tmp_path / name)
+
+
+def test_results_are_drawn_on_the_image_of_their_frame(
+    tracking: toftrack.Tracking, results: toftrack.Results
+) -> None:
+    picture = results.draw(tracking.depth_m, -1)
+    both = toftrack.draw(tracking.depth_m, results.estimates(2), tracking.camera)
+    assert np.array_equal(picture, both) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
+
+
+def test_results_become_a_table_of_pandas(
+    results: toftrack.Results, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        with pytest.raises(toftrack.ToftrackError, match="needs the package pandas.*pip install"):
+            results.to_pandas()
+    pytest.importorskip("pandas", reason="pip install '.[pandas]'")
+    table = results.to_pandas()
+    assert table["index"].tolist() == [0, 0, 1, 1, 2, 2] and table["lost"].dtype == bool
+    assert np.allclose(table["wrist_z_m"], results.joints_m[..., 0, 2].ravel())
+
+
+def test_the_device_is_closed_however_the_loop_ends() -> None:
+    for fails, leaves in ((None, False), (None, True), (toftrack.ToftrackError, False)):
+        camera = Camera(fails)
+        try:
+            for estimate in toftrack.track(camera, *PAPER):
+                assert camera.opened == 1
+                if leaves and estimate.index == 1:
+                    raise ZeroDivisionError
+        except (ZeroDivisionError, toftrack.ToftrackError) as error:
+            assert leaves or "unplugged" in str(error)
+        assert camera.opened == 0
+
+
+def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:
+    for words, said in (
+        (["gone.npz"], "there is no file 'gone.npz'"),
+        ([tmp_path / "gone.npz"], "there is no file"),
+        (["device=sample", "hand.syde=left"], "did you mean"),
+        (["device=sample", "a.npz"], "both give the frames"),
+        ([Camera(), "device.stop=2"], "track was given a device, a Camera; leave one out"),
+    ):
+        with pytest.raises(toftrack.ToftrackError, match=said):
+            toftrack.track(*words)
+
+
+def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:
+    assert len(toftrack.track(Camera(KeyboardInterrupt, live=True), *PAPER).results().lost) == 2
+    with pytest.raises(KeyboardInterrupt):
+        toftrack.track(Camera(KeyboardInterrupt), *PAPER).results()
+    ended = toftrack.PushDevice(Sample().camera)
+    ended.end()
+    with pytest.raises(toftrack.ToftrackError, match="no frame"):
+        toftrack.track(ended, *PAPER).results()
+
+
+def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(("127.0.0.1", 0))
+        words = ("stream=udp", f"stream.port={receiver.getsockname()[1]}", "smooth=one_euro")
+        tracking = toftrack.track("device=sample", "device.stop=3", *words, *QUICK)
+        smooth = [estimate.joints_m for estimate in tracking]
+        sent = [json.loads(receiver.recv(65535)) for _ in smooth]
+    assert np.allclose([line["joints_m"] for line in sent], smooth, atol=1e-6)
+    assert not np.array_equal(tracking.results().joints_m[2], smooth[2])
+
+
+def test_of_frames_that_are_pushed_the_newest_is_tracked() -> None:
+    depth, camera = sample().depth_m[:3].copy(), toftrack.PushDevice(Sample().camera)
+    frames = iter(camera)
+    camera.push(depth[0], 0.0)
+    first = next(frames)
+    for number in (1, 2):
+        camera.push(depth[number], number / 25)
+    depth[:] = 0  # the camera's own buffer
+    camera.end()
+    (last,) = frames
+    assert (first.index, last.index, last.timestamp_s, camera.dropped) == (0, 2, 0.08, 1)
+    assert np.array_equal(last.depth, sample().depth_m[2])
