@@ -98,14 +98,13 @@ def setting_names() -> frozenset[str]:
 
 
 def devices_of_files(others: Sequence[str] = ()) -> frozenset[str]:
-    """The choices of the group device that play a file: those with a path.
-
-    others: further folders, of --config-dir.
+    """The choices of the group device that play a file: those with a path, and whatever is in
+    `others`, the folders of --config-dir, where a path may stand in another file.
     """
-    folders = (configuration_folder(), *map(Path, others))
-    paths = [path for folder in folders for path in folder.glob("device/*.yaml")]
+    own = [path.stem for folder in others for path in Path(folder).glob("device/*.yaml")]
+    paths = (configuration_folder() / "device").glob("*.yaml")
     # By its keys, since a configuration does not count what is still to be given.
-    return frozenset(path.stem for path in paths if "path" in OmegaConf.load(path).keys())
+    return frozenset([*own, *(p.stem for p in paths if "path" in OmegaConf.load(p).keys())])
 
 
 @contextmanager

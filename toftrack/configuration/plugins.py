@@ -31,13 +31,8 @@ ENTRY_POINTS = {
     "view": "toftrack.views",
 }
 """Groups of conf/, and readers of recordings, with what the entry points for them are called."""
-_LEARNED = {
-    "_target_": "toftrack.pose_space.files.make_pose_space",
-    "dims": 4,
-    "file": None,
-    "data": "synthetic",
-}
-"""Of a pose space, whose class is not called itself: it is learned, or read from a file."""
+_LIKE = {"detector": "network", "gestures": "default", "pose_space": "pca"}
+"""Groups of which an installed part has the settings of a choice of toftrack's, too."""
 
 
 def installed(group: str) -> dict[str, EntryPoint]:
@@ -56,12 +51,14 @@ def offer_installed() -> None:
         for name, entry in installed(group).items():
             if group == "recordings" or (own / group / f"{name}.yaml").exists():
                 continue
-            settings: dict[str, Any] = {"_target_": entry.value.replace(":", ".")}
-            if group == "pose_space":
-                settings = _LEARNED | {"kind": name}
+            node: dict[str, Any] = {"_target_": entry.value.replace(":", ".")}
+            if group == "pose_space":  # whose class is not called, but learned, or read from a file
+                node = {"kind": name}
+            if group in _LIKE:
+                node["defaults"] = [_LIKE[group], "_self_"]
             # Which settings there are is known when it is imported, and not before.
-            node = OmegaConf.create(settings, flags={"struct": False})
-            ConfigStore.instance().store(name, node, group, provider=entry.module)
+            open_node = OmegaConf.create(node, flags={"struct": False})
+            ConfigStore.instance().store(name, open_node, group, provider=entry.module)
 
 
 def import_from(folder: str | Path) -> None:
