@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from toftrack.compute.quality import Pace
     from toftrack.devices.base import Device
+    from toftrack.tracking.backend import Backend
     from toftrack.tracking.model import FilterModel
     from toftrack.tracking.tracker import HandsTracker, Tracker
 
@@ -108,22 +109,22 @@ def build_model(config: DictConfig) -> FilterModel:
 
     Raises ToftrackError for parts of one tracker in the other.
     """
-    from toftrack.tracking.backend import choose_backend
     from toftrack.tracking.model import TrackerModel
     from toftrack.tracking.paper import PaperModel
 
     check_groups(config)
     check_tracker(config)
     device = compute_device(config.compute)
-    detector = instantiate(config.detector)
+    detector, likelihood = instantiate(config.detector), instantiate(config.likelihood)
+    backend: Backend = instantiate(config.renderer, device=device)
     parts: dict[str, Any] = {
         "configured": instantiate(config.hand),
         "space": instantiate(config.pose_space),
         "segmentation": instantiate(config.segmentation),
-        "likelihood": instantiate(config.likelihood),
+        "likelihood": likelihood,
         "filter": instantiate(config.filter),
         "gestures": instantiate(config.gestures),
-        "backend": choose_backend(config.renderer, device),
+        "backend": backend.judged_by(likelihood),
         "lost": instantiate(config.lost),
     }
     if detector is None:

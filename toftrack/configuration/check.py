@@ -63,8 +63,8 @@ _OF_PAPER = {
     "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=never"),
 }
 """Likewise the paper's."""
-_GROUPS = {"detector": "network", "posterior": "default"}
-"""Groups that a tracker needs, and their usual choices; the paper's needs the first alone."""
+_GROUPS = {"detector": "network", "renderer": "auto", "posterior": "default"}
+"""Groups that a tracker needs, and their usual choices; the paper's needs no posterior."""
 _NO_NETWORKS = "toftrack.detector.hand_detector.no_detector"
 
 
@@ -95,7 +95,8 @@ def check_groups(config: DictConfig) -> None:
     """Raise ToftrackError where a folder of somebody's own lacks a group."""
     paper = OmegaConf.select(config, "detector._target_") == _NO_NETWORKS
     for group, choice in _GROUPS.items():
-        if group not in config and not (paper and choice == "default"):
+        needless = paper and group == "posterior"
+        if not (needless or isinstance(config.get(group), DictConfig)):
             raise ToftrackError(
                 f"the configuration has no {group}; add '- {group}: {choice}' to the defaults of "
                 "your config.yaml"

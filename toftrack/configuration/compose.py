@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.check import check_overrides
+from toftrack.configuration.plugins import import_from, offer_installed
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
@@ -29,16 +31,24 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
     A Hydra application that calls this keeps its own state of Hydra.
 
+    config_dir: laid out as toftrack's conf/; its config.yaml takes the place of toftrack's, and
+    where it has none, it adds choices and modules, as --config-dir does.
+
     Raises ToftrackError when it cannot be composed.
     """
     folder = (
         configuration_folder() if config_dir is None else Path(config_dir).expanduser().resolve()
     )
     if not (folder / _ROOT).is_file():
+        if any(folder.glob("*/*.yaml")):
+            return configuration(searched(folder), *overrides)
         raise ToftrackError(
-            f"there is no {_ROOT} in the folder '{folder}'; give config_dir=FOLDER, a folder laid "
-            "out as toftrack's conf/"
+            f"there is no {_ROOT} in the folder '{folder}', nor a GROUP/NAME.yaml; give "
+            "config_dir=FOLDER, a folder laid out as toftrack's conf/"
         )
+    if folder != configuration_folder():
+        import_from(folder)
+    offer_installed()
     for override in overrides:
         if not isinstance(override, str):
             raise ToftrackError(
@@ -60,6 +70,25 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
         return config
 
 
+def searched(folder: str | Path) -> str:
+    """The override by which choices in a folder are found, as by Hydra's --config-dir; modules in
+    it can be imported from now on. Raises ToftrackError when there is no such folder.
+    """
+    path = Path(folder).expanduser().resolve()
+    if not path.is_dir():
+        raise ToftrackError(f"there is no folder '{folder}'; give --config-dir one")
+    import_from(path)
+    return f"hydra.searchpath=[{quoted(f'file://{path}')}]"
+
+
+def quoted(text: str) -> str:
+    """A text as a value of Hydra's that stands for just that, whatever signs are in it."""
+    # Hydra takes a backslash for itself only before a quote.
+    text = re.sub(r"(\\*)'", r"\1\1\\'", text)
+    text = re.sub(r"(\\+)$", r"\1\1", text)
+    return f"'{text}'"
+
+
 def setting_names() -> frozenset[str]:
     """The groups, and the settings that stand in none: how the keys of overrides begin."""
     folder = configuration_folder()
@@ -68,11 +97,14 @@ def setting_names() -> frozenset[str]:
     return frozenset({*own, *groups, "hydra"})
 
 
-def devices_of_files() -> frozenset[str]:
-    """The choices of the group device that play a file: those with a path."""
+def devices_of_files(others: Sequence[str] = ()) -> frozenset[str]:
+    """The choices of the group device that play a file: those with a path, and whatever is in
+    `others`, the folders of --config-dir, where a path may stand in another file.
+    """
+    own = [path.stem for folder in others for path in Path(folder).glob("device/*.yaml")]
     paths = (configuration_folder() / "device").glob("*.yaml")
     # By its keys, since a configuration does not count what is still to be given.
-    return frozenset(path.stem for path in paths if "path" in OmegaConf.load(path).keys())
+    return frozenset([*own, *(p.stem for p in paths if "path" in OmegaConf.load(p).keys())])
 
 
 @contextmanager

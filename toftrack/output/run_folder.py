@@ -135,7 +135,10 @@ class Run:
 
     def pose_space(self) -> PoseSpace:
         """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
-        settings = {k: v for k, v in self._settings("pose_space").items() if k != "_target_"}
+        settings = dict(self._settings("pose_space"))
+        target, kind = settings.pop("_target_", None), str(settings.get("kind"))
+        if target != f"{make_pose_space.__module__}.{make_pose_space.__name__}" or "." in kind:
+            raise self._of_its_own("pose space", kind if "." in kind else target)
         if settings.get("file"):
             settings["file"] = str(found_again(settings["file"], self._ran_in))
         space = make_pose_space(**settings)
@@ -161,12 +164,15 @@ class Run:
             )
         return settings
 
+    def _of_its_own(self, what: str, target: object) -> ToftrackError:
+        return ToftrackError(f"the run in '{self.folder}' has a {what} of its own: {target}")
+
     def _made(self, kind: type, group: str) -> Any:
         """Only kinds that are known here: a file must not say what is to be executed."""
         settings = dict(self._settings(group))
         target = settings.pop("_target_", None)
         if target != f"{kind.__module__}.{kind.__qualname__}":
-            raise ToftrackError(f"the run in '{self.folder}' has a {group} of its own: {target}")
+            raise self._of_its_own(group, target)
         # JSON has no word for infinity: a number that is null was one.
         for field in fields(kind):
             if field.type == "float" and settings.get(field.name, 0.0) is None:

@@ -17,10 +17,11 @@ from toftrack.hand.skeleton import ANGLE_LIMITS
 class PoseSpace:
     """A learned low-dimensional space of hand poses (paper, section 2.3).
 
-    A further kind is a subclass, whose tensors are what its model file holds, a function
-    `fit(angles, labels, dims, **settings)`, an entry in files.KINDS and a file in conf/pose_space/.
+    A further kind is a subclass, whose tensors are what its model file holds, with a class method
+    `fit(angles, labels, dims, **settings)` that learns one (docs/extending.md). toftrack's own have
+    functions for that, in files.KINDS.
 
-    kind: the name that stands in model files and configs.
+    kind: the name that stands in model files; that of the class where it gives none.
     lower, upper: (d,) bounds: the extremes of the training poses in each coordinate.
     training_latents: (M, d) the training poses, and training_labels their M names.
     """
@@ -31,6 +32,9 @@ class PoseSpace:
     upper: Tensor
     training_latents: Tensor
     training_labels: tuple[str, ...]
+
+    def __init_subclass__(cls) -> None:
+        cls.kind = vars(cls).get("kind", cls.__name__)
 
     @property
     def dims(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
+from toftrack.configuration.plugins import installed, named_object
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
@@ -48,7 +49,40 @@ KINDS: dict[str, tuple[type[PoseSpace], Callable[..., PoseSpace]]] = {
     "lle": (LLEPoseSpace, fit_lle),
     "pca": (PCAPoseSpace, fit_pca),
 }
-"""Every kind of space, and what learns one."""
+"""Every kind of toftrack's own, and what learns one."""
+
+
+def kind_of_space(
+    kind: str, of_file: str | None = None
+) -> tuple[type[PoseSpace], Callable[..., PoseSpace]]:
+    """The class of a kind and what learns one: of a name in KINDS, of an installed package's entry
+    point, or of a class that the configuration names, my_module.MySpace.
+
+    of_file: the data file that names it, if one does: there a class's path is only a name.
+    """
+    if kind in KINDS:
+        return KINDS[kind]
+    if kind in (others := installed("pose_space")):
+        space = named_object(others[kind].value, f"the installed pose space {kind}")
+    elif of_file is None and "." in kind:
+        space = named_object(kind, "pose_space.kind")
+    else:
+        known = ", ".join((*KINDS, *others))
+        what = f"{of_file} holds a pose space of the" if of_file else "pose_space"
+        raise ToftrackError(
+            f"{what} kind {kind!r}, which is not there; there are {known}, and your own by"
+            " pose_space.kind=MODULE.CLASS (docs/extending.md)"
+        )
+    if not (isinstance(space, type) and issubclass(space, PoseSpace)):
+        raise ToftrackError(f"pose_space.kind={kind} is no subclass of PoseSpace; name one")
+    return space, getattr(space, "fit", partial(_not_learned, kind))
+
+
+def _not_learned(kind: str, angles: Any, labels: Any, dims: int) -> PoseSpace:
+    raise ToftrackError(
+        f"pose_space.kind={kind} has no class method fit, and cannot be learned; write one, or give"
+        " pose_space.file=FILE"
+    )
 
 
 def fit_pose_space(
@@ -58,9 +92,7 @@ def fit_pose_space(
 
     settings: of that kind, as its `fit` takes them.
     """
-    if kind not in KINDS:
-        raise ToftrackError(f"pose_space kind {kind!r} is unknown; known: {', '.join(KINDS)}")
-    fit = KINDS[kind][1]
+    fit = kind_of_space(kind)[1]
     takes = tuple(inspect.signature(fit).parameters)[3:]
     unknown = [name for name in settings if name not in takes]
     if unknown:
@@ -94,29 +126,29 @@ def save_pose_space(
     write_archive(path, {"header": json.dumps(header), **arrays})
 
 
-def load_pose_space(path: str | Path) -> PoseSpace:
-    """Read a model file; ToftrackError when it is not one of this version and size."""
+def load_pose_space(path: str | Path, configured: str = "pca") -> PoseSpace:
+    """Read a model file; ToftrackError when it is not one of this version and size, or its kind is
+    neither the configured one nor one that kind_of_space knows.
+    """
     header, arrays = _read(path)
     kind, labels = header.get("kind"), header.get("training_labels")
-    if not isinstance(kind, str) or kind not in KINDS:
-        raise ToftrackError(
-            f"{path} holds a pose space of the unknown kind {kind!r}; known: {', '.join(KINDS)}"
-        )
+    made, _ = kind_of_space(configured)
+    if kind != made.kind:
+        made, _ = kind_of_space(str(kind), of_file=str(path))
     if header.get("angle_names") != list(ANGLE_NAMES):
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
             f" hand; {_ADVICE}"
         )
-    kind_of_space = KINDS[kind][0]
     expected = (TypeError, RuntimeError, IndexError, ValueError)
     with reported_errors(f"{path} is a damaged pose-space file", _ADVICE, *expected):
-        needed = {field.name for field in fields(kind_of_space)} - {"training_labels"}
+        needed = {field.name for field in fields(made)} - {"training_labels"}
         for name in sorted(set(arrays) ^ needed):
             raise ValueError(f"{'no' if name in needed else 'one too many'} array {name!r}")
         if not isinstance(labels, list):
             raise ValueError("no labels")
         tensors = {name: torch.from_numpy(array).float() for name, array in arrays.items()}
-        space = kind_of_space(**tensors, training_labels=tuple(labels))
+        space = made(**tensors, training_labels=tuple(labels))
         angles = space.decode(space.training_latents)
         if not all(bool(tensor.isfinite().all()) for tensor in (*tensors.values(), angles)):
             raise ValueError("not all finite")
@@ -166,11 +198,12 @@ def make_pose_space(
                 " train_pose_space.py for others: pose_space.file=FILE"
             )
         return fit_pose_space(kind, dims, _DATA[data](), **settings)
-    space = load_pose_space(file)
-    if space.kind != kind or space.dims != dims:
+    space = load_pose_space(file, kind)
+    wanted = kind_of_space(kind)[0].kind
+    if space.kind != wanted or space.dims != dims:
         raise ToftrackError(
             f"{file} is a {space.dims}-dimensional {space.kind} space and the configuration"
-            f" asks for a {dims}-dimensional {kind}; give pose_space={space.kind}"
+            f" asks for a {dims}-dimensional {wanted}; give pose_space={space.kind}"
             f" pose_space.dims={space.dims}"
         )
     return space

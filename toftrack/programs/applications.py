@@ -4,6 +4,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 import sys
@@ -14,7 +15,8 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.compose import devices_of_files, setting_names
+from toftrack.configuration.compose import devices_of_files, quoted, searched, setting_names
+from toftrack.configuration.plugins import offer_installed
 from toftrack.errors import ToftrackError
 from toftrack.programs import command_line
 from toftrack.recordings.bag_names import is_bag
@@ -60,6 +62,9 @@ def start(
 ) -> None:
     """Run a Hydra application; it reads the command line of the process."""
     folder = str(configuration_folder())
+    for own in config_folders(arguments):
+        searched(own)
+    offer_installed()
     application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
     before = sys.argv
     sys.argv = [program, *options_first(arguments)]
@@ -102,7 +107,9 @@ def with_recording(arguments: Sequence[str]) -> list[str]:
             "settings; rename the file"
         )
     device = next((word for word in others if word.startswith("device=")), None)
-    if device is not None and device.removeprefix("device=") not in devices_of_files():
+    if device is not None and device.removeprefix("device=") not in devices_of_files(
+        config_folders(arguments)
+    ):
         raise ToftrackError(
             f"{device} and the recording '{files[0]}' both give the frames; leave one out"
         )
@@ -114,6 +121,14 @@ def with_recording(arguments: Sequence[str]) -> list[str]:
         player = "rosbag" if is_bag(path) else "folder" if os.path.isdir(path) else "replay"
         chosen = [f"device={player}"]
     return [*chosen, f"device.path={quoted(name)}", *others]
+
+
+def config_folders(arguments: Sequence[str]) -> list[str]:
+    """What follows --config-dir on a command line."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", "-cd", action="append", default=[])
+    found: list[str] = parser.parse_known_args(list(arguments))[0].config_dir
+    return found
 
 
 def options_first(arguments: Sequence[str]) -> list[str]:
@@ -128,14 +143,6 @@ def options_first(arguments: Sequence[str]) -> list[str]:
             options.append("--info=all" if word in ("--info", "-i") else word)
         value_follows = not value_follows and word in _WITH_VALUE
     return [*options, *overrides]
-
-
-def quoted(text: str) -> str:
-    """A text as a value of Hydra's that stands for just that, whatever signs are in it."""
-    # Hydra takes a backslash for itself only before a quote.
-    text = re.sub(r"(\\*)'", r"\1\1\\'", text)
-    text = re.sub(r"(\\+)$", r"\1\1", text)
-    return f"'{text}'"
 
 
 def _is_file(argument: str, known: Collection[str]) -> bool:

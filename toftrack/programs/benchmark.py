@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from toftrack.configuration.compose import searched
 from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
 from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import plain_parser
@@ -97,7 +98,7 @@ def _accuracy(arguments: Sequence[str]) -> None:
     parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
     command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
-    accuracy.measure(parser.parse_intermixed_args(arguments), command, _write_picture)
+    accuracy.measure(_options(parser, arguments), command, _write_picture)
 
 
 def _ablation(arguments: Sequence[str]) -> None:
@@ -117,7 +118,7 @@ def _ablation(arguments: Sequence[str]) -> None:
     about = f"only some, separated by commas: {', '.join(known)}"
     parser.add_argument("--variants", type=variants, default=known, metavar="NAMES", help=about)
     command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
-    accuracy.ablate(parser.parse_intermixed_args(arguments), command)
+    accuracy.ablate(_options(parser, arguments), command)
 
 
 def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:
@@ -126,11 +127,19 @@ def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentPars
     about = "folders of recordings, or recordings; KEY=VALUE is an override as for track.py"
     parser.add_argument("what", nargs="+", metavar="FOLDER", help=about)
     parser.add_argument("--seeds", type=_seeds, default=[0], help="separated by commas (0)")
+    parser.add_argument("--config-dir", help="folder of choices of your own (docs/extending.md)")
     about = "processes (1); figures stay"
     parser.add_argument("--workers", type=_workers, default=1, metavar="N", help=about)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write everything there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
     return parser
+
+
+def _options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    options = parser.parse_intermixed_args(arguments)
+    if options.config_dir is not None:  # as an override it goes to the workers, too
+        options.what.append(searched(options.config_dir))
+    return options
 
 
 def _seeds(text: str) -> list[int]:

@@ -6,6 +6,7 @@ import argparse
 import json
 from collections.abc import Sequence
 
+from toftrack.configuration.compose import searched
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_set
 from toftrack.evaluation.public import evaluate, table, totals
@@ -22,12 +23,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("folder", metavar="FOLDER", help="where the data set lies")
     about = "as for track.py, filter.particles=1000"
     add("overrides", metavar="OVERRIDE", nargs="*", default=[], help=about)
+    add("--config-dir", help="folder of choices of your own (docs/extending.md)")
     add("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
     add("--frames", type=_count, help="only so many at the start of each sequence")
     about = "how far the labels' fingertips lie inside of ours, instead of the data set's own"
     add("--tip-inset", type=float, metavar="MM", help=about)
     add("--json", metavar="FILE", help="write the figures here, too")
     options = parser.parse_intermixed_args(arguments)
+    if options.config_dir is not None:
+        options.overrides.insert(0, searched(options.config_dir))
     data_set, sequences = open_data_set(options.data_set, options.folder)
     sequences = _chosen(sequences, options.sequences)
     inset_m = data_set.tip_inset_m if options.tip_inset is None else options.tip_inset / 1e3

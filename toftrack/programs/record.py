@@ -20,12 +20,11 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.compose import configuration, one_sentence
+from toftrack.configuration.compose import configuration, one_sentence, searched
 from toftrack.devices.base import Device
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError, check_number
 from toftrack.programs import shutdown
-from toftrack.programs.applications import quoted
 from toftrack.programs.command_line import plain_parser
 from toftrack.programs.shutdown import EndedError
 from toftrack.recordings.recorder import Recorder
@@ -168,10 +167,7 @@ def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:
     """
     overrides = list(options.overrides)
     if options.config_dir is not None:
-        folder = Path(options.config_dir).expanduser().resolve()
-        if not folder.is_dir():
-            raise ToftrackError(f"there is no folder '{options.config_dir}'; give --config-dir one")
-        overrides.insert(0, f"hydra.searchpath=[{quoted(folder.as_uri())}]")
+        overrides.insert(0, searched(options.config_dir))
     chosen = next((word for word in overrides if word.startswith("device=")), None)
     if raw and chosen not in (None, "device=sr3000"):
         raise ToftrackError(f"only an SR3000 is recorded to .srs; record {chosen} to .npz")

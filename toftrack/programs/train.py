@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -43,7 +44,12 @@ def train(config: DictConfig) -> float:
             "pose_space.file names a model to use, not to train; leave it out, the new model is"
             " written into the output folder"
         )
-    settings.pop("_target_", None)
+    target = settings.pop("_target_", None)
+    if "kind" not in settings:
+        raise ToftrackError(
+            f"pose_space._target_={target} cannot be learned here; name the class of your space as"
+            " kind in its file, as docs/extending.md shows"
+        )
     settings.pop("data", None)  # of the tracker's; here the group of this name says it
     kind, dims = settings.pop("kind"), settings.pop("dims")
     folder = Path(HydraConfig.get().runtime.output_dir)
@@ -74,10 +80,24 @@ def train(config: DictConfig) -> float:
     summary = _summary(kind, dims, data, rows)
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     say("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
-    say(f"use it: toftrack track pose_space={kind} pose_space.file={model}")
+    say(f"use it: {_command(model)}")
     if in_sweep():
         print(f"{job_words()}: {len(data)} training poses, error {error:.2f} degrees; {folder}")
     return error
+
+
+def _command(model: Path) -> str:
+    """How to track in the space that was learned."""
+    hydra = HydraConfig.get()
+    own = [place.path for place in hydra.runtime.config_sources if place.provider == "command-line"]
+    words = ["toftrack", "track", *(word for path in own for word in ("--config-dir", path))]
+    dims = [word for word in hydra.overrides.task if word.startswith("pose_space.dims")]
+    words += [
+        f"pose_space={hydra.runtime.choices['pose_space']}",
+        *dims,
+        f"pose_space.file={model}",
+    ]
+    return shlex.join(words)
 
 
 def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any]) -> list[Row]:

@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
 
+from toftrack.configuration.plugins import installed, named_object
 from toftrack.errors import ToftrackError
 from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts, read_npy
@@ -55,9 +56,10 @@ def open_recording(
     """Open a recording, whose kind follows from its name. Only `.npz` is loaded as a whole.
 
     path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder with
-    metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`.  camera_file, bare: of
-    what has no camera of its own, and says nothing of itself.  modulation_mhz: tells the range of a
-    `.srs` that does not state it.  topic: of a ROS bag that has several of depth images. Raises
+    metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`, or
+    of a suffix that an installed package reads (docs/extending.md).  camera_file, bare: of what has
+    no camera of its own, and says nothing of itself.  modulation_mhz: tells the range of a `.srs`
+    that does not state it.  topic: of a ROS bag that has several of depth images. Raises
     ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
@@ -74,6 +76,9 @@ def open_recording(
         return read_npy(path, camera_file, bare)
     if suffix in VIDEOS:
         return read_video(path, camera_file, bare)
+    if suffix != ".npz" and suffix[1:] in (others := installed("recordings")):
+        read = named_object(others[suffix[1:]].value, f"the installed reader of {suffix}")
+        return read(path)
     if suffix in ELSEWHERE:
         raise ToftrackError(f"'{path}' is not read: {ELSEWHERE[suffix]}")
     return read_recording(path)

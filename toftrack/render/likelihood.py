@@ -16,7 +16,8 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError, check_number
-from toftrack.render.scoring import Counts, Evidence
+from toftrack.hand.shape import HandShape
+from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import Observation
 
 _LEAST_M = np.float32(1e-3)
@@ -25,39 +26,20 @@ NAMINGS = ("printed", "standard")
 
 
 @dataclass(frozen=True)
-class FMeasure:
-    """The paper's F-measure of correct, false and missed pixels.
+class Likelihood:
+    """What every head has; one of one's own writes `score`.
 
     tolerance_m: a model pixel this near to the image's depth is correct (the paper: 0.02).
     neighbourhood_m: how far from the silhouette, at the hand's depth, pixels are missed ("in
         proportion to the finger's length": about a third of a finger).
-    beta: weight of the second of the two rates (paper: 1.5).
-    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so that
-        beta > 1 punishes *false* pixels more, while its text wants more penalty for missed ones.
-        "printed" is the paper's formula, "standard" the usual names.
-    residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
-        0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
-    coverage: how much hypotheses are preferred that explain more of the image: the F-measure is
-        content with a hand of which only a few pixels lie inside of it.
     """
 
     tolerance_m: float
     neighbourhood_m: float
-    beta: float
-    naming: str
-    residual_weight: float
-    coverage: float
 
     def __post_init__(self) -> None:
-        if self.naming not in NAMINGS:
-            raise ToftrackError(
-                f"likelihood.naming={self.naming} is unknown; give one of {', '.join(NAMINGS)}"
-            )
         check_number("likelihood.tolerance_m", self.tolerance_m, 0, above=True)
         check_number("likelihood.neighbourhood_m", self.neighbourhood_m, 0)
-        check_number("likelihood.beta", self.beta, 0, above=True)
-        check_number("likelihood.residual_weight", self.residual_weight, 0, 1)
-        check_number("likelihood.coverage", self.coverage, 0)
 
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
@@ -80,11 +62,55 @@ class FMeasure:
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
         return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)
 
+    def score(self, counts: Counts) -> Tensor:
+        """(N,) of N hypotheses, 0 .. 1; 0 where nothing is correct."""
+        raise NotImplementedError
+
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
-        """(N,) what the filter weighs by, up to a constant: log F + coverage log(correct).
+        """(N,) what the filter weighs by, up to a constant: log score + coverage log(correct).
 
         coverage: instead of the likelihood's own, for a search that compares very different poses.
         """
+        score = self.score(counts).log()
+        # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
+        return score + coverage * counts.correct.log() if coverage else score
+
+    def scorer(self, shape: HandShape, given: Scorer) -> Scorer:
+        """What makes the counts of a hand; that of the back end unless a head wants more of it."""
+        return given
+
+
+@dataclass(frozen=True)
+class FMeasure(Likelihood):
+    """The paper's F-measure of correct, false and missed pixels.
+
+    beta: weight of the second of the two rates (paper: 1.5).
+    naming: the paper prints precision = c / (c + missed) and recall = c / (c + false), so that
+        beta > 1 punishes *false* pixels more, while its text wants more penalty for missed ones.
+        "printed" is the paper's formula, "standard" the usual names.
+    residual_weight: how much of a correct pixel is lost at the edge of the depth tolerance,
+        0 (paper, all or nothing) .. 1 (a parabola that falls to 0).
+    coverage: how much hypotheses are preferred that explain more of the image: the F-measure is
+        content with a hand of which only a few pixels lie inside of it.
+    """
+
+    beta: float
+    naming: str
+    residual_weight: float
+    coverage: float
+
+    def __post_init__(self) -> None:
+        if self.naming not in NAMINGS:
+            raise ToftrackError(
+                f"likelihood.naming={self.naming} is unknown; give one of {', '.join(NAMINGS)}"
+            )
+        super().__post_init__()
+        check_number("likelihood.beta", self.beta, 0, above=True)
+        check_number("likelihood.residual_weight", self.residual_weight, 0, 1)
+        check_number("likelihood.coverage", self.coverage, 0)
+
+    def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
+        """See Likelihood."""
         coverage = self.coverage if coverage is None else coverage
         if counts.correct.device.type == "cpu":
             host = _host(counts)
@@ -93,9 +119,7 @@ class FMeasure:
                 if coverage:
                     found = found + np.float32(coverage) * np.log(host[0])
             return torch.from_numpy(found)
-        score = self.score(counts).log()
-        # 0 times the logarithm of no correct pixel would be NaN, and the largest of all.
-        return score + coverage * counts.correct.log() if coverage else score
+        return super().log_score(counts, coverage)
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""

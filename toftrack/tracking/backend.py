@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
@@ -14,6 +14,7 @@ from toftrack.compute.rigid import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
+from toftrack.render.likelihood import Likelihood
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.numba.scorer import score_rows as score_rows_compiled
 from toftrack.render.scoring import Scorer, ScoreRows, score_rows
@@ -24,7 +25,7 @@ from toftrack.render.torch_scorer import TorchScorer
 class Backend:
     """One way to compute everything that depends on the machine.
 
-    name: "torch", "numba" or "triton", as `renderer=` says it.
+    name: "torch", "numba", "triton", as `renderer=` says it, or one's own.
     device: where the particles are. A frame's estimate is on the CPU, where its few poses are
         refined and compared, as is all that is said of it.
     motions: of particles, on the device and on the CPU.
@@ -37,6 +38,17 @@ class Backend:
     motions: Motions
     make_scorer: Callable[[HandShape], Scorer]
     score_rows: ScoreRows = score_rows
+
+    def judged_by(self, likelihood: Likelihood) -> Backend:
+        """The same, with the scorers that a likelihood brings where it brings some."""
+        if getattr(type(likelihood), "scorer", Likelihood.scorer) is Likelihood.scorer:
+            return self
+        make = self.make_scorer
+        return replace(
+            self,
+            make_scorer=lambda shape: likelihood.scorer(shape, make(shape)),
+            score_rows=score_rows,  # others are compiled for their own scorers
+        )
 
 
 BACK_ENDS = ("torch", "numba", "triton")

@@ -25,7 +25,7 @@ from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
-from toftrack.render.likelihood import FMeasure
+from toftrack.render.likelihood import Likelihood
 from toftrack.render.scoring import Scorer
 from toftrack.render.segmentation import NearestSurface
 from toftrack.tracking.backend import Backend
@@ -95,7 +95,7 @@ class FilterModel:
     configured: Hand
     space: PoseSpace
     segmentation: NearestSurface
-    likelihood: FMeasure
+    likelihood: Likelihood
     filter: FilterSettings
     gestures: Gestures | None
     backend: Backend

@@ -17,7 +17,7 @@ from torch import Tensor
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import check_number
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.render.likelihood import FMeasure
+from toftrack.render.likelihood import Likelihood
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
 _FAR_SIGMAS = 3.0
@@ -51,7 +51,7 @@ class ImageTerm:
     coverage: weight of how much is explained; None = the likelihood's own.
     """
 
-    likelihood: FMeasure
+    likelihood: Likelihood
     scorer: Scorer
     evidence: Evidence
     device: torch.device

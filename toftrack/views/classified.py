@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from toftrack.hand.shape import HandShape
-from toftrack.render.likelihood import FMeasure
+from toftrack.render.likelihood import Likelihood
 from toftrack.render.model_image import parted, posed_hand, range_image
 from toftrack.render.reference import classify_range_images
 from toftrack.render.segmentation import Observation
@@ -47,7 +47,7 @@ class Classified:
 
 
 def classify(
-    state: np.ndarray, shape: HandShape, observation: Observation, likelihood: FMeasure
+    state: np.ndarray, shape: HandShape, observation: Observation, likelihood: Likelihood
 ) -> Classified:
     """Tell the pixels that the likelihood counts; their numbers are the scorer's counts.
 

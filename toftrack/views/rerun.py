@@ -37,7 +37,7 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_new
 from toftrack.frames.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
-from toftrack.render.likelihood import FMeasure
+from toftrack.render.likelihood import Likelihood
 from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.state import StepInfo
@@ -83,7 +83,7 @@ class RerunView(View):
         fps: float,
         frames: int | None = None,
         *,
-        likelihood: FMeasure,
+        likelihood: Likelihood,
         connect: str | None = None,
         spawn: bool = False,
     ) -> None:
@@ -220,7 +220,7 @@ _BONE_M, _JOINT_M, _PARTICLE_M = 0.003, 0.003, 0.0012
 class _Entities:
     """Logs frame after frame to a stream; one thread at a time."""
 
-    def __init__(self, stream: rr.RecordingStream, likelihood: FMeasure) -> None:
+    def __init__(self, stream: rr.RecordingStream, likelihood: Likelihood) -> None:
         self._stream, self._log, self._likelihood = stream, stream.log, likelihood
         self._pinholes: dict[str, tuple[bytes, int, int]] = {}
         self._reported: dict[int, tuple[str, ...]] = {}

@@ -1,0 +1,234 @@
+"""Parts of one's own, as docs/extending.md and docs/examples/plugins have them: from the folder of
+--config-dir and from an installed package, and what is said where one is not there."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from helpers import programs
+from helpers.tracking import ROOT
+from hydra.core.config_store import ConfigStore
+from hydra.utils import instantiate
+
+import toftrack
+from toftrack.api import build_model
+from toftrack.configuration import plugins
+from toftrack.configuration.compose import configuration
+from toftrack.devices.replay import Replay, Sample
+from toftrack.errors import ToftrackError
+from toftrack.files.archives import read_archive, write_archive
+from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
+
+PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
+FILES = dict(re.findall(r"<!-- test: extend (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
+EXAMPLES = ROOT / "docs" / "examples" / "plugins"
+MODULES = {"autoencoder", "point_to_surface", "socket_camera"}
+MODULES |= {name.removesuffix(".py") for name in FILES if name.endswith(".py")}
+GROUPS = ("pose_space", "likelihood", "renderer", "detector", "stream", "view", "gestures")
+OBJECTS = {
+    "pose_space": "my_space:Independent",
+    "likelihood": "my_likelihood:Overlap",
+    "renderer": "my_renderer:make",
+    "detector": "my_detector:make",
+    "device": "my_device:Millimetres",
+    "recordings": "my_reader:Raw16",
+    "stream": "my_stream:TipLog",
+    "view": "my_view:Snapshots",
+    "gestures": "my_gestures:make",
+}
+FRAMES = 4
+
+
+@pytest.fixture(autouse=True)
+def paths(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """What a run adds to the paths of modules is gone after it, with the modules."""
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    monkeypatch.setenv("PYTHONPATH", os.environ.get("PYTHONPATH", ""))
+    yield
+    for group in plugins.ENTRY_POINTS:
+        for name in ("theirs.yaml", "late.yaml"):
+            ConfigStore.instance().repo.get(group, {}).pop(name, None)
+    for name in MODULES:
+        sys.modules.pop(name, None)
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> Path:
+    """A folder with all that the page shows, in `my_conf`, and a recording for its readers."""
+    for name, text in FILES.items():
+        path = tmp_path / "my_conf" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    steps = [np.rint(np.minimum(f.depth, 65) * 1000).astype(np.uint16) for f in Sample(stop=FRAMES)]
+    np.save(tmp_path / "images.npy", np.stack(steps))
+    np.stack(steps).tofile(tmp_path / "images.raw16")
+    return tmp_path
+
+
+@pytest.fixture
+def package(mine: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The same, of an installed package that calls each part `theirs`."""
+    site = mine / "site"
+    facts = site / "mine-1.0.dist-info"
+    facts.mkdir(parents=True)
+    (facts / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
+    lines = []
+    for group, value in OBJECTS.items():
+        name = "raw16" if group == "recordings" else "theirs"
+        lines += [f"[{plugins.ENTRY_POINTS[group]}]", f"{name} = {value}"]
+    (facts / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    for name in FILES:
+        if name.endswith(".py"):
+            (site / name).write_text(FILES[name], encoding="utf-8")
+    monkeypatch.syspath_prepend(site)
+    importlib.invalidate_caches()
+    return mine
+
+
+def lines_of(group: str) -> int:
+    module = OBJECTS[group].partition(":")[0]
+    choice = "device/raw16.yaml" if group == "recordings" else f"{group}/mine.yaml"
+    return len((FILES[f"{module}.py"] + FILES[choice]).splitlines())
+
+
+def test_each_kind_takes_at_most_thirty_lines_with_its_settings() -> None:
+    assert {group: lines_of(group) for group in OBJECTS if lines_of(group) > 31} == {}
+    assert all(len(text.splitlines()) <= 25 for text in FILES.values())
+
+
+def test_a_folder_of_ones_own_brings_every_kind(mine: Path) -> None:
+    chosen = [f"{group}=mine" for group in GROUPS]
+    given = ("--config-dir", "my_conf", *chosen, "device=mine", "device.path=images.npy")
+    more = ("view.every=2", "likelihood.false_weight=0.5", "hydra.run.dir=out")
+    status, _, err = programs.call(*given, *more, folder=mine)
+    assert status == 0, err
+    with np.load(mine / "out" / "track.npz") as track:
+        facts = json.loads(track["metadata"].item())
+        assert not track["lost"].all() and len(track["lost"]) == FRAMES
+    assert facts["renderer"] == "coarse" and facts["pose_space"]["kind"] == "Independent"
+    assert facts["device"]["device"] == "Millimetres"
+    assert {"00000.png", "00002.png"} < {path.name for path in (mine / "out").iterdir()}
+    assert len((mine / "tips.txt").read_text().splitlines()) > 0
+    run = toftrack.read_run(mine / "out")
+    with pytest.raises(ToftrackError, match="has a pose space of its own: my_space.Independent"):
+        run.pose_space()
+
+
+def test_a_reader_of_ones_own_plays_a_range_and_takes_a_name(mine: Path) -> None:
+    given = ("--config-dir", "my_conf", "device=raw16", "images.raw16", "device.start=1")
+    status, _, err = programs.call(*given, "view=none", "hydra.run.dir=out", folder=mine)
+    assert status == 0, err
+    with np.load(mine / "out" / "track.npz") as track:
+        assert track["index"].tolist() == list(range(1, FRAMES))
+
+
+def test_in_python_a_folder_adds_its_choices(mine: Path) -> None:
+    overrides = (f"{group}=mine" for group in GROUPS if group not in ("stream", "view"))
+    tracker = toftrack.make_tracker(*overrides, config_dir=mine / "my_conf")
+    assert tracker.model.space.kind == "Independent" and "horns" in tracker.model.gestures.names
+    with pytest.raises(ToftrackError, match="no config.yaml in the folder"):
+        toftrack.make_tracker(config_dir=mine / "site")
+
+
+def test_an_installed_package_brings_every_kind(package: Path) -> None:
+    head = ["tolerance_m=0.02", "neighbourhood_m=0.02", "false_weight=1"]
+    given = [f"likelihood.{word}" for word in head] + ["pose_space.iterations=400"]
+    chosen = [f"{group}=theirs" for group in GROUPS]
+    camera = ("device=theirs", f"device.path={package / 'images.npy'}", "device.focal_px=200")
+    config = configuration(*chosen, *given, *camera, "stream.path=tips.txt", "view.every=5")
+    assert config.stream["_target_"] == "my_stream.TipLog"
+    assert not MODULES & set(sys.modules), "what is not used is not imported"
+    model = build_model(config)
+    assert model.space.kind == "Independent" and "horns" in model.gestures.names
+    assert type(model.likelihood).__name__ == "Overlap" and model.backend.make_scorer is not None
+    assert type(model.detector).__name__ == "Nearest"
+    assert instantiate(config.device).frames == FRAMES
+    view = instantiate(config.view, folder=package, fps=25.0, frames=FRAMES)
+    assert view.every == 5 and instantiate(config.stream).path == "tips.txt"
+    assert Replay(package / "images.raw16").frames == FRAMES
+    with pytest.raises(ToftrackError, match="pose_space.iteration is no setting of theirs"):
+        toftrack.make_tracker("pose_space=theirs", "pose_space.iteration=4")
+
+
+def test_an_installed_part_stands_behind_toftracks_own(package: Path) -> None:
+    entry = package / "site" / "mine-1.0.dist-info" / "entry_points.txt"
+    entry.write_text("[toftrack.pose_spaces]\npca = nowhere:Thing\nlate = nowhere:Thing\n")
+    assert configuration("pose_space=pca").pose_space.kind == "pca"
+    with pytest.raises(ToftrackError, match="pose space late names nowhere:Thing, which cannot"):
+        toftrack.make_tracker("pose_space=late")
+
+
+KIND = "holds a pose space of the kind 'autoencoder.Autoencoder', which is not there; there are"
+
+
+def test_a_model_file_names_its_kind_and_imports_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    own = fit_pose_space("autoencoder.Autoencoder", 3, steps=5)
+    model = tmp_path / "model.npz"
+    save_pose_space(own, model)
+    again = load_pose_space(model, "autoencoder.Autoencoder")
+    assert again.kind == "Autoencoder" and again.dims == 3
+    angles = again.decode(again.training_latents)
+    assert torch.allclose(angles, own.decode(own.training_latents))
+    del sys.modules["autoencoder"]
+    with pytest.raises(ToftrackError, match="of the kind 'Autoencoder', which is not there"):
+        load_pose_space(model)
+    content = read_archive(model)
+    header = json.loads(str(content["header"])) | {"kind": "autoencoder.Autoencoder"}
+    write_archive(model, content | {"header": np.array(json.dumps(header))})
+    with pytest.raises(ToftrackError, match=KIND):
+        load_pose_space(model)
+    assert "autoencoder" not in sys.modules
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("nowhere.Space", "pose_space.kind names nowhere.Space, which cannot be imported (No modu"),
+        ("json.JSONDecoder", "pose_space.kind=json.JSONDecoder is no subclass of PoseSpace"),
+        ("toftrack.pose_space.base.PoseSpace", "has no class method fit, and cannot be learned"),
+        ("magic", "pose_space kind 'magic', which is not there; there are isomap, kernel_pca"),
+    ],
+)
+def test_a_kind_that_cannot_be_used_is_one_sentence(kind: str, words: str) -> None:
+    with pytest.raises(ToftrackError) as caught:
+        fit_pose_space(kind, 3)
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_the_autoencoder_is_trained_in_a_sweep_and_tracks_from_its_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A sweep's jobs may run anywhere: another process finds the module, too."""
+    given = ("--config-dir", str(EXAMPLES), "-m", "pose_space=autoencoder", "compare=[]")
+    sweep = ("hydra.sweep.dir=sweep", "pose_space.dims=2,3", "pose_space.steps=9")
+    program = "train_pose_space.py"
+    monkeypatch.setattr("toftrack.programs.train.write_figures", lambda *_: [])
+    status, out, err = programs.call(*given, *sweep, folder=tmp_path, program=program)
+    assert status == 0, err
+    assert "#1 pose_space=autoencoder compare=[] pose_space.dims=3" in out
+    model = tmp_path / "sweep" / "1" / "pose_space.npz"
+    load = "from toftrack.pose_space.files import load_pose_space as load\n"
+    load += f"print(load({str(model)!r}, 'autoencoder.Autoencoder').dims)"
+    done = subprocess.run([sys.executable, "-c", load], capture_output=True, text=True)
+    assert done.stdout == "3\n", done.stderr
+
+
+def test_pose_spaces_without_a_class_are_not_trained(tmp_path: Path) -> None:
+    (tmp_path / "my_conf" / "pose_space").mkdir(parents=True)
+    (tmp_path / "my_conf" / "pose_space" / "own.yaml").write_text("_target_: mine.make\n")
+    given = ("--config-dir", "my_conf", "pose_space=own")
+    status, _, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
+    assert status == 1 and "pose_space._target_=mine.make cannot be learned here" in err
