@@ -3,7 +3,7 @@
 
 Each is a frame of a recording that lies in this repository, all drawn and all CC0, tracked from its
 beginning with the tracker's own settings: the depth image in colours (near is red), with the
-estimated joints. Prints the mean and the largest error of each.
+estimated joints. Prints the errors and the flags of each.
 """
 
 from __future__ import annotations
@@ -20,19 +20,32 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
 from make_moving_picture import coloured  # noqa: E402
 
+from toftrack.hand.skeleton import JOINT_PARENTS  # noqa: E402
 from toftrack.views.skeleton import draw_hands  # noqa: E402
 
 STRANGERS = "tests/data/strangers"
+SAMPLES = "toftrack/data/sample"
 PICTURES = {
     "counting": (f"{STRANGERS}/02_count_near", 22, 1),
-    "at_camera": (f"{STRANGERS}/04_point_at_camera", 40, 1),
+    "at_the_camera": (f"{STRANGERS}/04_point_at_camera", 10, 1),
+    "ok": (f"{STRANGERS}/11_ok_relaxed", 4, 1),
+    "victory": (f"{STRANGERS}/08_object_passes", 58, 1),
+    "two_hands": (f"{SAMPLES}_two_hands", 60, 2),
+    "two_hands_near": (f"{STRANGERS}/10_hands_front", 10, 2),
+    "glass": (f"{SAMPLES}_glass", 40, 1),
+    "bottle": (f"{STRANGERS}/13_drink", 28, 1),
+    "box": (f"{STRANGERS}/15_pick_up", 58, 1),
+    "wrong_phone": (f"{STRANGERS}/14_phone", 58, 1),
+    "wrong_from_the_head": (f"{STRANGERS}/16_ego_bare", 10, 1),
+    "wrong_hidden": (f"{STRANGERS}/08_object_passes", 28, 1),
 }
-"""Of each picture its recording, its frame, and how many hands are followed."""
+"""Of each picture its recording, its frame, and how many hands are followed. What is wrong has the
+true joints beside the estimated ones, in white."""
 WIDTH, QUALITY = 396, 80
 
 
-def picture(recording: str, number: int, hands: int) -> tuple[np.ndarray, str]:
-    """(h, w, 3) uint8 BGR of a frame, and what is printed of it."""
+def picture(recording: str, number: int, hands: int, wrong: bool) -> tuple[np.ndarray, str]:
+    """(h, w, 3) uint8 BGR of a frame, with the truth where it is wrong; what is printed of it."""
     tracker = toftrack.make_hands_tracker("seed=0", f"hands={hands}")
     with toftrack.make_device("device=replay", f"device.path={ROOT / recording}.npz") as device:
         camera, truth = device.camera, device.truth
@@ -43,18 +56,25 @@ def picture(recording: str, number: int, hands: int) -> tuple[np.ndarray, str]:
                 break
     drawn = coloured(depth_m)
     drawn = cv2.resize(drawn, (WIDTH, WIDTH * camera.height // camera.width))
-    draw_hands(drawn, camera, estimates, (drawn.shape[1] / camera.width,) * 2)
-    first = estimates[0]
-    away_mm = 1000 * np.linalg.norm(first.joints_m - truth.joints_m[number - truth.first], axis=1)
+    scale = drawn.shape[1] / camera.width
+    draw_hands(drawn, camera, estimates, (scale, scale))
+    first, true_m = estimates[0], truth.joints_m[number - truth.first]
+    if wrong:
+        ends = np.rint(scale * camera.project(true_m)).astype(int).tolist()
+        for end, parent in zip(ends[1:], JOINT_PARENTS[1:], strict=True):
+            cv2.line(drawn, end, ends[parent], (255, 255, 255), 2, cv2.LINE_AA)
+    away_mm = 1000 * np.linalg.norm(first.joints_m - true_m, axis=1)
+    off = away_mm > 40
     return drawn, (
-        f"mean {away_mm.mean():.0f} mm, largest {away_mm.max():.0f} mm, confidence "
+        f"mean {away_mm.mean():.0f} mm, largest {away_mm.max():.0f} mm, {off.sum()} joints over "
+        f"40 mm off, {(off & ~first.joint_ok).sum()} of them flagged, confidence "
         f"{first.confidence:.2f}, {first.state_name}, lost {first.lost}, {first.gesture}"
     )
 
 
 def main(names: list[str]) -> None:
     for name in names or PICTURES:
-        drawn, said = picture(*PICTURES[name])
+        drawn, said = picture(*PICTURES[name], wrong=name.startswith("wrong"))
         made = ROOT / "docs" / "gallery" / f"{name}.webp"
         made.parent.mkdir(exist_ok=True)
         made.write_bytes(cv2.imencode(".webp", drawn, [cv2.IMWRITE_WEBP_QUALITY, QUALITY])[1])
