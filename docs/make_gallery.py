@@ -1,9 +1,9 @@
 #!/usr/bin/env python3
-"""Makes the pictures of docs/gallery.md, docs/gallery/*.webp: python docs/make_gallery.py [NAME ...]
+"""Makes the pictures of docs/gallery.md: python docs/make_gallery.py [NAME ...]
 
-Each is a frame of a recording that lies in this repository, all drawn and all CC0, tracked from its
-beginning with the tracker's own settings: the depth image in colours (near is red), with the
-estimated joints. Prints the errors and the flags of each.
+Each, docs/gallery/NAME.webp, is a frame of a recording that lies in this repository; all are drawn
+and CC0. It is tracked from its beginning with the tracker's own settings and shown as a depth image
+in colours (near is red), with the estimated joints. Prints the errors and the flags of each.
 """
 
 from __future__ import annotations

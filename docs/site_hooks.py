@@ -16,24 +16,32 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parents[1]
-OUTSIDE = (
-    *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "SECURITY.md", "CITATION.cff", "LICENSE", "Dockerfile"),
-    *("tests/data/real/README.md", "tests/data/strangers/README.md", "toftrack/data/README.md"),
-    *("toftrack/data/browser.png", "toftrack/data/pose_spaces.png"),
-)
-"""Pages and pictures that do not stand in docs/."""
 NOTEBOOK = "docs/tour.ipynb"
 
 
+PAGE = NOTEBOOK.replace(".ipynb", ".md")
+
+
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """The files of the site: of the theme, of docs/, and those outside."""
+    """The files of the theme and of docs/, the pages of the navigation, and what they all link."""
     of_theme = [file for file in files if file.src_dir != config.docs_dir]
-    ours = [f"docs/{file.src_uri}" for file in files if file.src_dir == config.docs_dir]
+    paths = {f"docs/{file.src_uri}" for file in files if file.src_dir == config.docs_dir}
+    found = linked(paths | set(re.findall(r"[\w./]+\.md", str(config.nav))) - {PAGE})
     place = str(ROOT), config.site_dir, config.use_directory_urls
-    made = [File(path, *place) for path in (*ours, *OUTSIDE)]
-    page = NOTEBOOK.replace(".ipynb", ".md")
+    made = [File(path, *place) for path in sorted(found)]
     tour = notebook_page(json.loads((ROOT / NOTEBOOK).read_text(encoding="utf-8")))
-    return Files([*of_theme, *made, File.generated(config, page, content=tour)])
+    return Files([*of_theme, *made, File.generated(config, PAGE, content=tour)])
+
+
+def linked(paths: set[str]) -> set[str]:
+    """Files of the repository, and those that the pages among them link or show."""
+    found = set(paths)
+    for page in (ROOT / path for path in paths if path.endswith(".md")):
+        for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
+            place = (page.parent / target).resolve()
+            if place.is_file() and place.is_relative_to(ROOT):
+                found.add(place.relative_to(ROOT).as_posix())
+    return found if found == paths else linked(found)
 
 
 def on_page_markdown(markdown: str, **kwargs: object) -> str:
