@@ -34,7 +34,7 @@ ALLOWED_SKIPS = (
     r"pip install '.\[browser-test\]'|needs chromium and chromedriver",
     r"pip install '.\[(osc|export|pandas)\]'",
     r"needs npm|npm could not install three",
-    r"jsonschema is not installed",
+    r"(jsonschema|mkdocs) is not installed",
     r"there is no C compiler",
     r"there is no C# compiler",
     r"needs /dev/full|needs /proc",

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
 import zipfile
+from email import message_from_bytes
 from pathlib import Path
 
 import pytest
@@ -85,6 +88,32 @@ def test_an_editable_installation_is_the_path_of_the_checkout(
     with zipfile.ZipFile(tmp_path / build.build_editable(str(tmp_path))) as wheel:
         [path] = _names(wheel)
         assert path.endswith(".pth") and wheel.read(path).decode().strip() == str(ROOT)
+
+
+def test_the_wheel_says_on_which_pythons_it_runs(site: Path) -> None:
+    [metadata] = site.glob("toftrack-*.dist-info/METADATA")
+    said = message_from_bytes(metadata.read_bytes())
+    named = re.findall(r"Python :: (3\.\d+)", "\n".join(said.get_all("Classifier", [])))
+    assert named == ["3.11", "3.12", "3.13"] and said["Requires-Python"] == f">={named[0]}"
+
+
+def test_the_image_gets_all_that_the_wheel_is_made_of(
+    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the Dockerfile copies, as there is no Docker in a test."""
+    copied = re.findall(r"^COPY (.+) (\S+)$", (ROOT / "Dockerfile").read_text(), re.M)
+    for names, target in copied:
+        place = tmp_path / target.lstrip("/")
+        for name in names.split():
+            if (ROOT / name).is_dir():
+                shutil.copytree(ROOT / name, place, ignore=shutil.ignore_patterns("__pycache__"))
+            else:
+                place.mkdir(exist_ok=True)
+                shutil.copy(ROOT / name, place)
+    monkeypatch.chdir(tmp_path / "src")
+    with zipfile.ZipFile(tmp_path / build.build_wheel(str(tmp_path))) as wheel:
+        made = {str(path.relative_to(site)) for path in site.rglob("*") if path.is_file()}
+        assert {name for name in made if "__pycache__" not in name} == set(wheel.namelist())
 
 
 def test_the_source_archive_holds_no_tests_and_no_pages() -> None:

@@ -11,6 +11,8 @@ from pathlib import Path
 import pytest
 from helpers.tracking import ROOT
 
+import toftrack
+
 sys.path.insert(0, str(ROOT / "docs"))
 from figure_tables import HISTORY_HEAD, NOT_YET, history_row, history_rows, with_tables
 from make_rooms import PICTURE, imports, layers, picture
@@ -51,6 +53,32 @@ def test_links_lead_somewhere_and_marked_tables_are_those_of_the_figures(page: P
         assert not mark or mark in marks(target), f"{file}#{mark}"
     assert text.count("<!-- figures: ") == text.count("<!-- end -->")
     assert with_tables(text, FIGURES) == text, "run: python docs/make_figures.py --tables"
+
+
+def test_every_page_stands_in_the_navigation_and_every_public_name_in_the_reference() -> None:
+    """Links and pictures are checked by mkdocs build --strict, in CI."""
+    named = set(re.findall(r": (\S+\.md)$", (ROOT / "mkdocs.yml").read_text(), re.M))
+    there = {str(page.relative_to(ROOT)) for page in PAGES} | {"docs/tour.md"}
+    assert there <= named, "a page is missing in mkdocs.yml"
+    assert all((ROOT / name).exists() for name in named - {"docs/tour.md"})
+    reference = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    shown = set(re.findall(r"^::: toftrack\.(\w+)$", reference, re.M))
+    assert shown == set(toftrack.__all__) - {"__version__"}
+
+
+def test_the_notebook_becomes_a_page() -> None:
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed")
+    from site_hooks import as_list, notebook_page
+
+    page = notebook_page(json.loads((ROOT / "docs" / "tour.ipynb").read_text(encoding="utf-8")))
+    assert page.startswith("# ") and page.count("data:image/jpeg;base64,") == 2
+    assert "```python\nimport" in page and "30 frames, 0 of them lost" in page
+    points = "Draws.\n\nimage: (H, W), 0 = no\nreading.  camera: of it.\nReturns it."
+    assert as_list(points).split("\n\n")[1:] == [
+        "- `image`: (H, W), 0 = no\nreading.",
+        "- `camera`: of it.",
+        "Returns it.",
+    ]
 
 
 def test_the_picture_of_the_rooms_is_of_this_code() -> None:

@@ -109,7 +109,7 @@ class Fitted:
         )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class HandShape:
     """Sizes of one hand, metres, in the hand frame of a right hand.
 
@@ -128,6 +128,18 @@ class HandShape:
     thickness: float = 1.0
     side: str = "right"
     fitted: Fitted | None = None
+
+    # Copies that share their tensors have the same surface, which is kept for both. Dataclasses ask
+    # `==` of each field from Python 3.13 on, and that of tensors has no truth value.
+    def _same(self) -> tuple[object, ...]:
+        tensors = map(id, (self.base_m, self.base_frames, self.bone_lengths_m))
+        return (*tensors, self.thickness, self.side, self.fitted)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, HandShape) and self._same() == other._same()
+
+    def __hash__(self) -> int:
+        return hash(self._same())
 
     def to(self, *args: object, **kwargs: object) -> HandShape:
         """The same shape on another device or of another dtype, as `torch.Tensor.to`."""
