@@ -263,7 +263,7 @@ def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
         assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.h5"])
+@pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.klg", "a.CSV"])
 def test_of_other_kinds_the_error_says_how_to_convert_them(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToftrackError, match=rf"{name}' is not read: .*(PNG|npy|folder|points)"):
         open_recording(tmp_path / name)
