@@ -45,9 +45,9 @@ class Replay(BaseDevice):
     frame when the next one is already due (the last is always delivered); otherwise every frame, as
     fast as it is asked for.  camera_file, intrinsics (fx, fy, cx, cy in pixels): instead of the
     recording's own camera.  unit_m (metres of one step of whole numbers), fps, dataset (of a
-    `.h5` or `.mat` that has several): of recordings that do not say it.  store: the recording, where it is
-    open already. Raises ToftrackError: the recording or the camera cannot be used, or the range
-    lies outside.
+    `.h5` or `.mat` that has several): of recordings that do not say it.  store: the recording,
+    where it is open already. Raises ToftrackError: the recording or the camera cannot be used, or
+    the range lies outside.
     """
 
     def __init__(

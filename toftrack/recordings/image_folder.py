@@ -8,7 +8,8 @@
 | `timestamps.txt` | optional: the frames' times, seconds, a line each |
 
 Images of colours or of 8 bits beside them are left out, and, where names have "depth" in them,
-those that have not. Numbers in names go by value. The images may lie in a folder of that folder, if they all do.
+those that have not. Numbers in names go by value. The images may all lie in one folder of that
+folder.
 
 The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 0.001; of floats,
 1), `radial` (false), `fps` (25), `metadata` (an object).

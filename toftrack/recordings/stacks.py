@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import struct
-import tokenize
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -25,8 +24,6 @@ from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_m
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 from toftrack.recordings.images import pages_of
 
-_BROKEN = (ValueError, EOFError, TypeError, SyntaxError, OverflowError, tokenize.TokenError)
-"""What numpy raises of a damaged `.npy`."""
 _PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
 """Which axes are frames, rows and columns; the last is MATLAB's as HDF5 sees it."""
 _COMPRESSED = 15
@@ -111,15 +108,8 @@ def _reported(path: Path, what: str = "") -> Iterator[None]:
 
 
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
-    try:
-        with reading(path):
-            images = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _BROKEN as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
-            "numpy.save"
-        ) from error
+    with _reported(path):
+        images = np.load(path, mmap_mode="r", allow_pickle=False)
     return (images[None] if images.ndim == 2 else images), _PYTHONS
 
 
