@@ -113,8 +113,31 @@ def compressed(depth: np.ndarray, words: str = "16UC1; compressedDepth png") -> 
         header = struct.pack("<iff", 1, a, b)
         with np.errstate(divide="ignore"):
             pixels = np.where(depth > 0, np.rint(a / depth + b), 0).astype(np.uint16)
-    data = header + cv2.imencode(".png", pixels)[1].tobytes()
+    packed = rvl(pixels) if words.endswith("rvl") else cv2.imencode(".png", pixels)[1].tobytes()
+    data = header + packed
     return {"format": words, "data": np.frombuffer(data, np.uint8)}
+
+
+def rvl(pixels: np.ndarray) -> bytes:
+    """(H, W) uint16 as RVL packs them, number by number."""
+    values, numbers, at, before = pixels.ravel().tolist(), [], 0, 0
+    while at < len(values):
+        for of_zeros in (True, False):
+            end = next((i for i in range(at, len(values)) if (values[i] == 0) != of_zeros), None)
+            end = len(values) if end is None else end
+            numbers.append(end - at)
+            for value in values[at:end] if not of_zeros else ():
+                step, before = value - before, value
+                numbers.append(2 * step if step >= 0 else -2 * step - 1)
+            at = end
+    nibbles = ""
+    for number in numbers:
+        while number > 7:
+            nibbles, number = nibbles + f"{8 + number % 8:x}", number // 8
+        nibbles += f"{number:x}"
+    nibbles += "0" * (-len(nibbles) % 8)
+    words = [int(nibbles[i : i + 8], 16) for i in range(0, len(nibbles), 8)]
+    return struct.pack(f"<II{len(words)}I", *pixels.shape[::-1], *words)
 
 
 def camera_info(camera: Camera, model: str = "plumb_bob", **changes: Any) -> dict:

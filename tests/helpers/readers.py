@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from helpers import bags, videos
 from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
 from helpers.tracking import run
+from scipy.io import savemat
 
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration
@@ -34,8 +37,8 @@ from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
+from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.unfinished import Facts, UnfinishedRecording, compressed, recover_recording
@@ -170,7 +173,32 @@ def _recordings(folder: Path) -> list[Reader]:
     np.save(stack, np.rint(1000 * depth).astype(np.uint16))
     words = np.rint(1000 * depth).astype(np.uint16)
     grey = videos.write_grey(_new(folder, "grey") / "grey.mkv", words)
-    for bare in (stack, grey):
+    pages = _new(folder, "tif") / "stack.tif"
+    cv2.imwritemulti(str(pages), list(words))
+    matlab = _new(folder, "mat") / "stack.mat"
+    savemat(matlab, {"depth": words}, do_compression=True)
+    bare_ones = [stack, grey, pages, matlab]
+    zipped = _new(folder, "zip") / "images.zip"
+    with zipfile.ZipFile(zipped, "w", zipfile.ZIP_DEFLATED) as archive:
+        for file in (*png.iterdir(), pages):
+            archive.write(file, f"take/{file.name}")
+    single = _new(folder, "float") / "1.tif"
+    cv2.imwrite(str(single), depth[0])
+    inside = {"folder: a float TIFF": single}
+    if find_spec("h5py") is not None:
+        import h5py
+
+        bare_ones.append(_new(folder, "h5") / "stack.h5")
+        with h5py.File(bare_ones[-1], "w") as target:
+            target.create_dataset("depth", data=words, compression="gzip")
+    if find_spec("OpenEXR") is not None:
+        import OpenEXR
+
+        inside["folder: an EXR"] = _new(folder, "exr") / "1.exr"
+        OpenEXR.File({}, {"Z": depth[0]}).write(str(inside["folder: an EXR"]))
+    for file in inside.values():
+        camera.save(file.with_name("camera.json"))
+    for bare in bare_ones:
         camera.save(bare.parent / "of_bare.json")
     about = videos.calibration(np.array([[252.0, 0, 160], [0, 252, 144], [0, 0, 1]]), 512, (96, 90))
     large = np.tile(words[:1], (1, 12, 10))  # a mode of its camera
@@ -182,8 +210,9 @@ def _recordings(folder: Path) -> list[Reader]:
         Reader("PNG folder: camera.json", png / "camera.json", png, play),
         Reader("PNG folder: an image", png / "depth_000000.png", png, play),
         Reader("PNG folder: timestamps.txt", png / "timestamps.txt", png, play),
-        _alone("stack .npy", stack, play),
-        _alone("grey video", grey, play),
+        *(_alone(f"bare {bare.suffix}", bare, play) for bare in bare_ones),
+        _alone("images .zip", zipped, play),
+        *(Reader(name, file, file.parent, play) for name, file in inside.items()),
         _alone("Kinect's video", kinect, play),
     ]
 

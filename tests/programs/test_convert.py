@@ -18,8 +18,8 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.programs import convert, record
 from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.image_folder import PngFolderWriter, read_image_folder
 from toftrack.recordings.npz import read_recording
-from toftrack.recordings.png_folder import PngFolderWriter, read_png_folder
 from toftrack.recordings.srs import read_srs
 
 REPORTED = BareFacts((30.0, 30.0, 16.0, 12.0))
@@ -206,7 +206,7 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     with PngFolderWriter(tmp_path / "f", camera, 0.0005, True, 30.0, {"a": 1}) as writer:
         for number in range(2):
             writer.append(depth[number], amplitude, number / 7)
-    folder = read_png_folder(tmp_path / "f")
+    folder = read_image_folder(tmp_path / "f")
     np.testing.assert_array_equal(folder.image(0)[0][0, :5], 0)
     np.testing.assert_allclose(folder.image(1)[0], depth[1], atol=0.00026)
     np.testing.assert_array_equal(folder.image(1)[1], amplitude)
@@ -220,14 +220,13 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"image_1": np.ones((6, 9), np.uint16)}, "1.png.*9x6"),
-        ({"image_1": np.ones((6, 8), np.uint8)}, "1.png.*16-bit"),
         ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
         ({"camera": {"fps": "fast"}}, "fps"),
         ({"camera": {"K": [[1]]}}, "3x3"),
         ({"timestamps.txt": b"0\n1\n"}, "3 finite times"),
         ({"amplitude_1.png": PNG}, "3 depth and 1 amplitude"),
         ({"1.png": PNG[:40]}, "1.png.*damaged"),
-        ({"1.png": b""}, "1.png.*no PNG"),
+        ({"1.png": b""}, "1.png.*damaged"),
     ],
 )
 def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
@@ -236,10 +235,10 @@ def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], wo
         if isinstance(content, bytes):
             (folder / name).write_bytes(content)
     with pytest.raises(ToftrackError, match=words):
-        read_png_folder(folder).image(0)
+        read_image_folder(folder).image(0)
 
 
 def test_what_is_no_folder_of_images_is_reported(tmp_path: Path) -> None:
     for folder, words in ((tmp_path / "nope", "no folder"), (tmp_path, "no depth image")):
         with pytest.raises(ToftrackError, match=words):
-            read_png_folder(folder)
+            read_image_folder(folder)

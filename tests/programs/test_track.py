@@ -27,7 +27,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.output.results import read_results
+from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.run_folder import read_run
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.export import export
@@ -269,6 +269,14 @@ def test_a_bad_setting_is_one_clear_sentence_before_anything_is_written(
     assert (status, out) == (1, "")
     assert err.startswith("error: ") and err.count("\n") == 1
     assert words in err
+
+
+def test_a_run_that_is_refused_as_another_one_is_writing_leaves_its_log(here, tmp_path) -> None:
+    with ResultWriter(tmp_path / "out", {}, JOINT_NAMES):
+        (tmp_path / "out" / "track.log").write_text("of the first run\n")
+        status, _, err = here("device.stop=2", "view=none")
+        assert status == 1 and "another run is writing into the folder" in err
+        assert (tmp_path / "out" / "track.log").read_text().startswith("of the first run\n")
 
 
 def test_an_output_folder_that_cannot_be_written_is_one_clear_sentence(here, tmp_path) -> None:

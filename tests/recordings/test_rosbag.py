@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,15 +25,17 @@ from helpers.bags import (
     image,
     recorded_ns,
     recording,
+    rvl,
     write_bag,
 )
+from helpers.damage import damaged
 
 from toftrack.devices.replay import Bag, Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings import ros_messages
 from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.ros_messages import camera_of
+from toftrack.recordings.ros_messages import camera_of, decoded_rvl
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.store import open_recording
 
@@ -52,8 +56,28 @@ def colour(number: int = 0) -> Message:
     return Message(COLOUR, IMAGE, fields | {"width": 32}, recorded_ns(number))
 
 
+def test_rvl_is_unpacked_and_whatever_is_damaged_in_it_reported() -> None:
+    random = np.random.default_rng(0)
+    pixels = random.integers(0, 65536, (24, 32)) * (random.random((24, 32)) > 0.4)
+    pixels[3:6] = 0
+    pixels = pixels.astype(np.uint16)
+    for some in (pixels, np.zeros_like(pixels), np.full_like(pixels, 700)):
+        np.testing.assert_array_equal(decoded_rvl(rvl(some)), some)
+    content = rvl(pixels)
+    sizes = [struct.pack("<II", *size) for size in ((2**31, 2**31), (0, 5), (32, 25), (31, 24))]
+    cut = [content[:length] for length in (0, 7, 9, 40, len(content) - 8)]
+    for bad in (*cut, *(size + content[8:] for size in sizes), content[:8] + b"\xff" * 400):
+        with pytest.raises(ToftrackError, match="RVL is damaged"):
+            decoded_rvl(bad)
+    for seed in range(200):
+        with contextlib.suppress(ToftrackError):
+            assert decoded_rvl(damaged(content, seed)).dtype == np.uint16
+
+
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "16UC1; compressedDepth"])
+@pytest.mark.parametrize(
+    "encoding", ["16UC1", "32FC1", "16UC1; compressedDepth", "16UC1; compressedDepth rvl"]
+)
 def test_every_kind_of_bag_gives_the_frames_that_went_in(
     tmp_path: Path, kind: str, encoding: str
 ) -> None:
@@ -254,9 +278,10 @@ def test_no_reading_is_zero_in_every_encoding() -> None:
     assert (found[0, :4] == 0).all() and np.isfinite(found).all()
 
 
-def test_quantised_inverse_depth_is_exact_to_its_steps() -> None:
+@pytest.mark.parametrize("packed", ["png", "rvl"])
+def test_quantised_inverse_depth_is_exact_to_its_steps(packed: str) -> None:
     depth = some_depth(1)[0]
-    message = as_message(compressed(depth, "32FC1; compressedDepth png"))
+    message = as_message(compressed(depth, f"32FC1; compressedDepth {packed}"))
     found = ros_messages.depth_image(message, COMPRESSED, 0.001)
     # A step of 1 / z is 1 / 10100 m.
     np.testing.assert_array_less(np.abs(found - depth), depth**2 / 10100 / 2 + 1e-5)
@@ -266,7 +291,8 @@ def test_quantised_inverse_depth_is_exact_to_its_steps() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda f: f | {"format": "16UC1; compressedDepth rvl"}, "only PNG is read"),
+        (lambda f: f | {"format": "16UC1; compressedDepth rvl"}, "RVL is damaged"),
+        (lambda f: f | {"format": "16UC1; jpeg compressed bgr8"}, "not depth"),
         (lambda f: f | {"data": f["data"][:40]}, "PNG is damaged"),
         (lambda f: f | {"format": "32FC1; compressedDepth png"}, "make no sense"),
         (

@@ -16,8 +16,8 @@ from toftrack.frames.camera import Camera
 from toftrack.recordings import npz
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.recordings.npz import StreamedImages
-from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH, encode_frame, unambiguous_range_m
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.store import open_recording

@@ -18,7 +18,7 @@ from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.png_folder import read_png_folder
+from toftrack.recordings.image_folder import read_image_folder
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import (
@@ -44,8 +44,10 @@ class Replay(BaseDevice):
     path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, and drop a
     frame when the next one is already due (the last is always delivered); otherwise every frame, as
     fast as it is asked for.  camera_file, intrinsics (fx, fy, cx, cy in pixels): instead of the
-    recording's own camera.  store: the recording, where it is open already. Raises ToftrackError:
-    the recording or the camera cannot be used, or the range lies outside.
+    recording's own camera.  unit_m (metres of one step of whole numbers), fps, dataset (of a
+    `.h5` or `.mat` that has several): of recordings that do not say it.  store: the recording,
+    where it is open already. Raises ToftrackError: the recording or the camera cannot be used, or
+    the range lies outside.
     """
 
     def __init__(
@@ -58,16 +60,24 @@ class Replay(BaseDevice):
         camera_file: str | Path | None = None,
         modulation_mhz: int = DEFAULT_MODULATION_MHZ,
         intrinsics: Sequence[float] | None = None,
+        unit_m: float | None = None,
+        fps: float | None = None,
+        dataset: str | None = None,
         store: FrameStore | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=PATH")
         if store is None:
-            bare = BareFacts(intrinsics)
+            bare = BareFacts(intrinsics, unit_m, fps, dataset)
             store = open_recording(path, camera_file, modulation_mhz, bare=bare)
+            for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
+                if told is not None and told != own:
+                    raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
         self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
+        if store.left_out:
+            _log.warning("%s: %s", path, store.left_out)
         self._range = _checked_range(start, stop, len(store), path)
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         if intrinsics is not None and camera_file is not None:
@@ -171,7 +181,7 @@ class Folder(Replay):
     ) -> None:
         if not path:
             raise ToftrackError("no folder was given; set device.path=FOLDER")
-        store = read_png_folder(path, camera_file, BareFacts(intrinsics, unit_m, fps))
+        store = read_image_folder(path, camera_file, BareFacts(intrinsics, unit_m, fps))
         playback |= {"camera_file": camera_file, "intrinsics": intrinsics}
         super().__init__(path, store=store, **playback)
         self.description |= {"device": "folder", "unit_m": store.unit_m}

@@ -39,7 +39,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.camera import Camera
-from toftrack.recordings.png import read_png
+from toftrack.recordings.images import read_png
 
 FPS = 30.0
 """Frames a second of all data sets."""

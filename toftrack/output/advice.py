@@ -238,7 +238,7 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if mostly("out_of_reach"):
         found.append(
             f"Nothing was within segmentation.max_distance_m={reach_m:g}: hold the hand nearer, "
-            "or raise that."
+            "or raise that; if it was nearer, the images are of another unit (device.unit_m)."
         )
     if mostly("too_near"):
         found.append(

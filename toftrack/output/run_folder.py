@@ -276,7 +276,9 @@ def open_tracked(
     camera_file = about.get("camera_file")
     modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
     camera_path = None if camera_file is None else found_again(camera_file, ran_in)
-    bare = BareFacts(device.get("intrinsics"), device.get("unit_m"), device.get("fps"))
+    bare = BareFacts(
+        device.get("intrinsics"), device.get("unit_m"), device.get("fps"), device.get("dataset")
+    )
     return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
 
 

@@ -3,8 +3,8 @@
 IN and OUT are each a `.srs` (the SR3000's stream), a `.npz` (toftrack's recording) or a folder of
 16-bit PNG images with a camera file; the kind follows from the name. IN may also be a ROS bag
 (`.bag`, `.mcap`, `.db3`, a folder), an Azure Kinect's `.mkv`, a lossless grey video of 16 bits
-(FFV1), or a `.npy` stack (frames, rows, columns). Bare images do not say their lens: give
-`--intrinsics FX FY CX CY` (pixels) or `--camera FILE`.
+(FFV1), a `.zip` of images, or a stack: `.npy`, `.tif`, `.h5`, `.mat`. Bare images do not say their
+lens: give `--intrinsics FX FY CX CY` (pixels) or `--camera FILE`.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.recordings.npz import write_recording
-from toftrack.recordings.png_folder import PngFolderWriter
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     REGISTERS,
@@ -54,10 +54,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--intrinsics", type=float, nargs=4, metavar=names, help=about)
     add("--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)")
     add("--fps", type=float, help="frames a second of bare images (25)")
+    add("--dataset", help="the depth stack in a .h5 or .mat that has several")
     options = parser.parse_args(arguments)
     lens = None if options.intrinsics is None else tuple(options.intrinsics)
     read = options.camera, options.modulation, options.unit, options.overwrite, options.topic
-    bare = BareFacts(lens, options.source_unit, options.fps)
+    bare = BareFacts(lens, options.source_unit, options.fps, options.dataset)
     count = convert(options.source, options.target, *read, bare)
     print(f"{options.target}: {count} frames")
 
@@ -105,6 +106,8 @@ def convert(
             _warn("the ground truth has no place in the new format and is left out")
         if damage := store.damage:
             _warn(f"{source}: {damage}; the frames before are converted")
+        if store.left_out:
+            _warn(f"{source}: {store.left_out}")
         with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
             if kind == ".npz":
                 write_recording(target, store, bar.update)

@@ -43,6 +43,7 @@ _OF_CONVERT = {
     "device.intrinsics": "--intrinsics",
     "device.unit_m": "--source-unit",
     "device.fps": "--fps",
+    "device.dataset": "--dataset",
     "device.topic": "--topic",
     "device.modulation_mhz": "--modulation",
     "camera.file": "--camera",

@@ -1,9 +1,8 @@
-"""Images that say nothing of lens, unit and frame rate: what is given instead; `.npy` stacks."""
+"""Images that say nothing of lens, unit and frame rate: what is given instead."""
 
 from __future__ import annotations
 
 import math
-import tokenize
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,12 +12,9 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import LARGEST_MEDIAN_M, median_reading
-from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 
 MILLIMETRE = 0.001
 _BESIDE = "camera.json"
-_BROKEN = (ValueError, EOFError, TypeError, SyntaxError, OverflowError, tokenize.TokenError)
-"""What numpy raises of a damaged `.npy`."""
 
 
 @dataclass(frozen=True)
@@ -30,6 +26,8 @@ class BareFacts:
     unit_m: float | None = None
     """Metres of one step of whole numbers."""
     fps: float | None = None
+    dataset: str | None = None
+    """The name of the depth stack in a file that may hold several."""
 
     def __post_init__(self) -> None:
         for name in ("unit_m", "fps"):
@@ -86,53 +84,13 @@ def bare_camera(
     )
 
 
-class NpyStack(FrameStore):
-    """The frames of a stack, mapped from the disk as long as this object lives."""
-
-    def __init__(self, images: np.ndarray, camera: Camera, bare: BareFacts) -> None:
-        whole = images.dtype.kind in "ui"
-        self.camera, self.metadata = camera, {}
-        self.unit_m = bare.unit_m or (MILLIMETRE if whole else 1.0)
-        self.fps = bare.fps or DEFAULT_FPS
-        self.timestamp_s = np.arange(len(images)) / self.fps
-        self._images = images
-
-    def image(self, index: int) -> tuple[np.ndarray, None]:
-        image = np.asarray(self._images[index])
-        depth = image.astype(np.float32) * np.float32(self.unit_m)
-        return np.where((depth > 0) & (depth < np.inf), depth, np.float32(0)), None
-
-
-def read_npy(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> NpyStack:
-    """Open a stack.
-
-    camera_file: None = the given intrinsics, or camera.json beside the file.  bare: intrinsics,
-    unit of whole numbers (a millimetre) and frame rate (25) where given. Raises ToftrackError: it
-    is no such stack, holds pickled objects, or nothing tells its camera.
-    """
-    path = file_of(path)
-    try:
-        with reading(path):
-            images = np.load(path, mmap_mode="r", allow_pickle=False)
-    except _BROKEN as error:
-        reason = " ".join(str(error).split())
-        raise ToftrackError(
-            f"'{path}' is no .npy of numbers, or was cut off ({reason}); save the depth with "
-            "numpy.save"
-        ) from error
-    if images.ndim == 2:
-        images = images[None]
-    if images.ndim != 3 or images.size == 0 or images.dtype.kind not in "uif":
-        raise ToftrackError(
-            f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth images, "
-            "(frames, rows, columns) of numbers"
-        )
-    count, height, width = images.shape
-    stack = NpyStack(images, bare_camera(path, camera_file, bare, width, height), bare)
-    some = [stack.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
-    remedy = "; say what one step is with toftrack convert --source-unit METRES"
-    check_metres(np.stack(some), f"'{path}'", remedy)
-    return stack
+def size_of(path: Path, camera_file: str | Path | None, bare: BareFacts) -> np.ndarray | None:
+    """Width and height of the images, as far as the camera that is given, or lies beside, tells."""
+    beside = path.parent / _BESIDE
+    if camera_file is not None or bare.intrinsics is None and beside.exists():
+        camera = Camera.load(camera_file or beside)
+        return np.array((camera.width, camera.height))
+    return None if bare.intrinsics is None else 2 * np.array(bare.intrinsics[2:]) + 1
 
 
 def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:

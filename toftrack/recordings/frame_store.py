@@ -32,6 +32,8 @@ class FrameStore:
     """Metres of one step, where the images are whole numbers."""
     damage: str | None = None
     """Why it ends earlier than it should, in words; None when it is whole."""
+    left_out: str | None = None
+    """What lies beside the frames and is not used, in words."""
 
     def __len__(self) -> int:
         return len(self.timestamp_s)

@@ -2,7 +2,7 @@
 
 REP 118: `16UC1` counts millimetres, 0 = no reading; `32FC1` is metres, NaN or infinity = no
 reading. Of compressed ones those without loss are read: `compressedDepth` (a header of 12 bytes,
-then a PNG; of 32FC1 the PNG holds quantised inverse depths, whose two parameters stand in the
+then a PNG or RVL; of 32FC1 these hold quantised inverse depths, whose two parameters stand in the
 header), and plain PNGs of 16 bits. Messages are objects with ROS's fields, whoever parsed them.
 """
 
@@ -15,12 +15,13 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.recordings.png import SIGNATURE, decoded_png
+from toftrack.recordings.images import LARGEST_PIXELS, SIGNATURE, decoded_png
 
 IMAGE = "sensor_msgs/msg/Image"
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 _WORDS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 """Encodings that may hold depth, and their type. mono16 is rather infrared: only when asked for."""
+_SIZE = struct.Struct("<II")
 _HEADER = struct.Struct("<iff")
 """Of compressedDepth: the kind of quantisation, and its two parameters."""
 
@@ -71,10 +72,13 @@ def _decompressed(message: Any) -> np.ndarray:
         raise ToftrackError(f"it is {_colour(words)}, not depth")
     if not _lossless(words):
         raise ToftrackError(
-            f"it is compressed as '{words}', of which only PNG is read; play the bag and record it "
-            "again with image_transport's format png, or as raw images"
+            f"it is compressed as '{words}', of which only PNG and RVL are read; play the bag "
+            "and record it again with image_transport's format png, or as raw images"
         )
     data = np.asarray(message.data, np.uint8)
+    if "rvl" in words.partition(";")[2]:
+        depth = decoded_rvl(data[_HEADER.size :].tobytes())
+        return _from_inverse(depth, data.tobytes()) if words.startswith("32FC1") else depth
     start = data[: _HEADER.size + len(SIGNATURE)].tobytes().find(SIGNATURE)
     if start not in (0, _HEADER.size):
         raise ToftrackError(
@@ -92,7 +96,7 @@ def _decompressed(message: Any) -> np.ndarray:
 
 def _from_inverse(image: np.ndarray, header: bytes) -> np.ndarray:
     """The quantised inverse depths of compressed 32FC1 to (H, W) float32 metres."""
-    _, a, b = _HEADER.unpack(header)
+    _, a, b = _HEADER.unpack_from(header)
     if not (np.isfinite([a, b]).all() and a > 0):
         raise ToftrackError(f"the parameters of its quantised depth make no sense, {a:g} and {b:g}")
     gap = image.astype(np.float32) - np.float32(b)
@@ -100,10 +104,50 @@ def _from_inverse(image: np.ndarray, header: bytes) -> np.ndarray:
         return np.where(image > 0, np.float32(a) / gap, np.float32(0))
 
 
+def decoded_rvl(content: bytes) -> np.ndarray:
+    """An image of 16 bits, (H, W), of what RVL packed (Wilson, "Fast Lossless Depth Image
+    Compression", ISS 2017), after its width and height. ToftrackError, which begins with "it".
+
+    Nibbles, the highest of each little-endian word of 32 bits first, hold three bits of a number,
+    the lowest first, and whether more follow. The numbers are, in turn: how many pixels are 0; how
+    many after these are not; and of each of those the difference to the last that was not 0, of
+    either sign (0, -1, 1, -2, ...).
+    """
+    width, height = _SIZE.unpack_from(content) if len(content) >= _SIZE.size else (0, 0)
+    pixels = width * height
+    words = np.frombuffer(content[_SIZE.size : len(content) // 4 * 4], "<u4")
+    damaged = ToftrackError("its RVL is damaged")
+    if not 0 < pixels <= LARGEST_PIXELS or not words.size:
+        raise damaged
+    data = words.byteswap().view(np.uint8)
+    nibbles = np.stack((data >> 4, data & 15), 1).ravel().astype(np.int64)
+    ends = np.flatnonzero(nibbles < 8)
+    starts = np.append(0, ends[:-1] + 1)
+    if not ends.size or (ends - starts).max() > 10:
+        raise damaged
+    places = np.arange(ends[-1] + 1) - np.repeat(starts, ends - starts + 1)
+    numbers = np.add.reduceat((nibbles[: ends[-1] + 1] & 7) << 3 * places, starts)
+    runs, at, found = [], 0, 0
+    while found < pixels and at < len(numbers):
+        zeros, others = numbers[at : at + 2].tolist() if at + 1 < len(numbers) else (pixels, 1)
+        runs.append((at, zeros, others))
+        found, at = found + zeros + others, at + 2 + others
+    if found != pixels or at > len(numbers):
+        raise damaged
+    counts = np.array(runs)
+    is_difference = np.ones(at, bool)
+    is_difference[counts[:, 0]] = is_difference[counts[:, 0] + 1] = False
+    steps = numbers[:at][is_difference]
+    image = np.zeros(pixels, np.uint16)
+    where = np.repeat(np.tile([False, True], len(runs)), counts[:, 1:].ravel())
+    image[where] = np.cumsum((steps >> 1) ^ -(steps & 1)) & 0xFFFF
+    return image.reshape(height, width)
+
+
 def _lossless(words: str) -> bool:
     transport = words.partition(";")[2]
     if "compressedDepth" in transport:
-        return "rvl" not in transport
+        return True
     return "png" in transport
 
 

@@ -1,4 +1,4 @@
-"""A recording of any kind behind one face: `.npz`, `.srs`, a folder of images, a ROS bag, ..."""
+"""A recording of any kind behind one face: `.npz`, a folder of images, a ROS bag, a stack, ..."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ from pathlib import Path
 
 from toftrack.configuration.plugins import installed, named_object
 from toftrack.errors import ToftrackError
+from toftrack.files.safe_files import open_to_read
 from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts, read_npy
-from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.frame_store import FrameStore, file_of, reading
+from toftrack.recordings.image_folder import read_image_folder
 from toftrack.recordings.npz import read_recording
-from toftrack.recordings.png_folder import read_png_folder
 from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.srs import read_srs
+from toftrack.recordings.stacks import DATASETS, STACKS, read_stack
 from toftrack.recordings.video import VIDEOS, read_video
 
 _BY_OPENNI = (
@@ -24,8 +26,15 @@ _BY_OPENNI = (
     "(docs/formats.md) and give the folder"
 )
 _BY_IMAGES = "export its depth frames as 16-bit PNG images or .npy, and convert those"
+_BY_FOLDER = "a recording is the folder that the images lie in; give that"
 _BY_NUMBERS = "save the depth images as 16-bit PNG, numbered, and give their folder"
-_BY_ARRAY = "save its depth as .npy (frames, rows, columns), and convert that"
+_BY_ARRAY = "save its depth as .npy (frames, rows, columns), and give that"
+_BY_PACKER = "unpack it, and give the folder or file that is in it; of archives .zip is read"
+_BY_SDK = (
+    "export its depth by the program that wrote it, as 16-bit PNG images, and give their folder"
+)
+_NO_DEPTH = "it holds no depth images; give the recording that it was made of"
+_NO_OBJECTS = "it may hold objects that run code, and is never opened; " + _BY_ARRAY
 _BY_POINTS = "points have lost the image that they came from; give the depth images themselves"
 FIRST_SAMPLE = "right_hand"
 SAMPLES = (FIRST_SAMPLE, "left_hand", "two_hands", "point_and_pinch", "glass")
@@ -36,14 +45,24 @@ ELSEWHERE = {
     ".rrf": _BY_IMAGES,
     ".ply": _BY_POINTS,
     ".pcd": _BY_POINTS,
-    ".png": "a recording is the folder that the images lie in; give that",
-    ".tif": _BY_NUMBERS,
-    ".tiff": _BY_NUMBERS,
-    ".h5": _BY_ARRAY,
-    ".hdf5": _BY_ARRAY,
-    ".raw": "say what it is: read it with numpy, save .npy (frames, rows, columns), convert that",
+    ".klg": "write its depth out as 16-bit PNG images (a logger's own tools do), give their folder",
+    ".r3d": "export its depth from Record3D as EXR images, and give their folder",
+    ".csv": "a table is no image; " + _BY_ARRAY,
+    ".sens": "take its depth out by ScanNet's reader as 16-bit PNG images, and give their folder",
+    ".part": "it is unfinished: toftrack recover FILE makes a recording of it",
+    ".jsonl": "it is what a tracker found, not what a camera saw; give the recording",
+    **dict.fromkeys((".svo", ".svo2", ".xed", ".vrs", ".dng", ".heic", ".rrd", ".ifs"), _BY_SDK),
+    **dict.fromkeys((".png", ".exr"), _BY_FOLDER),
+    **dict.fromkeys((".pgm", ".pfm", ".dpt", ".jp2", ".jxl"), _BY_NUMBERS),
+    **dict.fromkeys((".raw", ".bin", ".dat", ".depth", ".zarr", ".parquet", ".txt"), _BY_ARRAY),
+    **dict.fromkeys((".pkl", ".pickle", ".pt", ".pth", ".joblib"), _NO_OBJECTS),
+    **dict.fromkeys((".7z", ".rar", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".zst"), _BY_PACKER),
+    **dict.fromkeys((".zstd", ".lz4"), _BY_PACKER),
+    **dict.fromkeys((".jpg", ".jpeg", ".bmp", ".webp", ".gif", ".json", ".yaml"), _NO_DEPTH),
+    **dict.fromkeys((".glb", ".bvh", ".obj", ".stl", ".fbx", ".las", ".laz", ".e57"), _BY_POINTS),
 }
 """What to do with files of other kinds."""
+_READ = "a folder of images, .npz, .zip, .npy, .tif, .h5, .mat, .mkv, .avi, .bag, .mcap, .db3, .srs"
 
 
 def open_recording(
@@ -55,11 +74,12 @@ def open_recording(
 ) -> FrameStore:
     """Open a recording, whose kind follows from its name. Only `.npz` is loaded as a whole.
 
-    path: `.npz`, `.srs`, a folder of PNG images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder with
-    metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), `.npy`, or
-    of a suffix that an installed package reads (docs/extending.md).  camera_file, bare: of what has
-    no camera of its own, and says nothing of itself.  modulation_mhz: tells the range of a `.srs`
-    that does not state it.  topic: of a ROS bag that has several of depth images. Raises
+    path: `.npz`, `.srs`, a folder or `.zip` of images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder
+    with metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), a stack (`.npy`, `.tif`,
+    `.h5`, `.mat`), or of a suffix that an installed package reads (docs/extending.md).
+    camera_file, bare: of what has no camera of its own, and says nothing of itself.
+    modulation_mhz: tells the range of a `.srs` that does not state it.  topic: of a ROS bag that
+    has several of depth images. Raises
     ToftrackError: it cannot be used; one sentence that names it.
     """
     path = Path(path).expanduser()
@@ -68,12 +88,14 @@ def open_recording(
         return read_rosbag(path, topic, camera_file, bare.unit_m)
     if topic is not None:
         raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {topic}; leave it out")
-    if path.is_dir():
-        return read_png_folder(path, camera_file, bare)
+    if bare.dataset is not None and suffix not in DATASETS:
+        raise ToftrackError(f"'{path}' has no dataset {bare.dataset}; leave device.dataset out")
+    if path.is_dir() or suffix == ".zip":
+        return read_image_folder(path, camera_file, bare)
     if suffix == ".srs":
         return read_srs(path, modulation_mhz)
-    if suffix == ".npy":
-        return read_npy(path, camera_file, bare)
+    if suffix in STACKS:
+        return read_stack(path, camera_file, bare)
     if suffix in VIDEOS:
         return read_video(path, camera_file, bare)
     if suffix != ".npz" and suffix[1:] in (others := installed("recordings")):
@@ -81,6 +103,11 @@ def open_recording(
         return read(path)
     if suffix in ELSEWHERE:
         raise ToftrackError(f"'{path}' is not read: {ELSEWHERE[suffix]}")
+    if suffix != ".npz":
+        with reading(file_of(path)), open_to_read(path) as stream:
+            if stream.read(2) != b"PK":
+                kind = f"files that end with {suffix}" if suffix else "a file without an ending"
+                raise ToftrackError(f"'{path}' is not read, as are no {kind}; give {_READ}")
     return read_recording(path)
 
 

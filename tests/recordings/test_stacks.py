@@ -1,0 +1,210 @@
+"""Stacks in one file, TIFF, HDF5 and MATLAB's: what comes out, what is chosen, what is refused."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from helpers.damage import damaged
+from scipy.io import savemat
+
+from toftrack.api import make_device
+from toftrack.devices.replay import Replay
+from toftrack.errors import ToftrackError
+from toftrack.programs import convert
+from toftrack.recordings import stacks
+from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.npz import read_recording
+from toftrack.recordings.store import ELSEWHERE, open_recording
+
+COUNT, HEIGHT, WIDTH = 5, 24, 32
+GIVEN = BareFacts((40.0, 40.0, 15.5, 11.5))
+RANDOM = np.random.default_rng(0)
+WORDS = RANDOM.integers(300, 2000, (COUNT, HEIGHT, WIDTH)).astype(np.uint16)
+METRES = WORDS.astype(np.float32) / 1000
+
+
+def h5py() -> Any:
+    return pytest.importorskip("h5py", reason="h5py is not installed")
+
+
+def hdf5(path: Path, **arrays: Any) -> Path:
+    with h5py().File(path, "w") as file:
+        for name, array in arrays.items():
+            file.create_dataset(name, data=array, compression="gzip", chunks=True)
+    return path
+
+
+def tiff(path: Path, images: np.ndarray) -> Path:
+    cv2.imwritemulti(str(path), list(images))
+    return path
+
+
+def mat(path: Path, **arrays: Any) -> Path:
+    savemat(path, arrays, do_compression=True)
+    return path
+
+
+def matlab_7_3(path: Path, images: np.ndarray) -> Path:
+    with h5py().File(path, "w", userblock_size=512) as file:
+        file.create_dataset("depth", data=images.transpose(0, 2, 1))
+    content = path.read_bytes()
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(512) + content[512:])
+    return path
+
+
+MATLABS = METRES.transpose(1, 2, 0)
+KINDS: dict[str, Callable[[Path], Path]] = {
+    "16-bit TIFF": lambda at: tiff(at / "a.tif", WORDS),
+    "float TIFF": lambda at: tiff(at / "a.TIFF", METRES),
+    "HDF5": lambda at: hdf5(at / "a.h5", depth=WORDS),
+    "HDF5, frames last": lambda at: hdf5(at / "a.hdf5", depth=MATLABS),
+    "MATLAB": lambda at: mat(at / "a.mat", depth=MATLABS),
+    "SciPy's .mat": lambda at: mat(at / "a.mat", depth=WORDS),
+    "MATLAB 7.3": lambda at: matlab_7_3(at / "a.mat", METRES),
+}
+each_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+def opened(path: Path, dataset: str | None = None) -> FrameStore:
+    return open_recording(path, bare=BareFacts(GIVEN.intrinsics, dataset=dataset))
+
+
+@each_kind
+def test_every_stack_gives_the_frames_that_went_in(tmp_path: Path, kind: str) -> None:
+    store = opened(KINDS[kind](tmp_path))
+    assert (len(store), store.fps, store.camera.width) == (COUNT, 25, WIDTH)
+    for number in (3, 0, 4, 4):
+        depth, amplitude = store.image(number)
+        np.testing.assert_allclose(depth, METRES[number], atol=1e-6)
+        assert depth.dtype == np.float32 and amplitude is None
+        store.close()
+
+
+@each_kind
+def test_what_is_damaged_or_cut_off_is_read_or_told(tmp_path: Path, kind: str) -> None:
+    path = KINDS[kind](tmp_path)
+    content = path.read_bytes()
+    cut = [content[: len(content) * part // 10] for part in range(10)]
+    for new in (*cut, *(damaged(content, seed) for seed in range(40))):
+        path.write_bytes(new)
+        with contextlib.suppress(ToftrackError):
+            store = opened(path)
+            for number in range(min(len(store), COUNT)):
+                store.image(number)
+            store.close()
+
+
+@pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])
+def test_the_dataset_is_chosen_by_its_name(tmp_path: Path, write: Callable[..., Path]) -> None:
+    path = write(tmp_path / f"a.{'h5' if write is hdf5 else 'mat'}", depth=WORDS, ir=WORDS // 2)
+    with pytest.raises(ToftrackError, match=r"device\.dataset=NAME.*depth.*ir"):
+        opened(path)
+    with pytest.raises(ToftrackError, match="no array of images 'color'.*depth"):
+        opened(path, "color")
+    np.testing.assert_allclose(opened(path, "ir").image(1)[0], WORDS[1] // 2 / 1000, atol=1e-6)
+    words = [f"device.path={path}", "device.dataset=/depth", "device.unit_m=0.0005"]
+    lens = "device.intrinsics=[40,40,15.5,11.5]"
+    with make_device("device=replay", *words, lens, "device.fps=50") as device:
+        first = next(iter(device))
+    assert device.fps == 50
+    np.testing.assert_allclose(first.depth, METRES[0] / 2, atol=1e-6)
+    out, numbers = str(tmp_path / "out.npz"), "40 40 15.5 11.5".split()
+    convert.main([str(path), out, "--dataset", "depth", "--intrinsics", *numbers])
+    np.testing.assert_allclose(read_recording(out).image(2)[0], METRES[2], atol=1e-6)
+
+
+@pytest.mark.parametrize("given", [{"unit_m": 0.002}, {"fps": 7}, {"dataset": "depth"}])
+def test_what_a_recording_says_itself_is_not_given(tmp_path: Path, given: dict[str, Any]) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, depth_m=METRES, K=np.diag((40, 40, 1)))
+    with pytest.raises(ToftrackError, match=f"leave device.{next(iter(given))} out"):
+        Replay(path, **given)
+
+
+def directory(width: int, height: int, following: int = 0, tile: int = 0) -> bytes:
+    tags = {256: width, 257: height, 258: 16, 277: 1, 339: 1} | (
+        {322: tile, 323: tile} if tile else {}
+    )
+    entries = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", following)
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (directory(60_000, 60_000), "larger than any camera's"),
+        (directory(32, 24, 0, 100_000), "tiles are larger"),
+        (directory(32, 24, 8), "no end"),
+        (directory(32, 24, 2**31), "damaged"),
+        (b"II+\0" + bytes(4) + struct.pack("<Q", 2**63), "damaged"),
+        (cv2.imencode(".tif", np.zeros((4, 4, 3), np.uint8))[1].tobytes(), "grey"),
+        (b"nonsense", "grey"),
+    ],
+)
+def test_a_tiff_that_lies_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ToftrackError, match=f"a.tif' cannot be read .*{words}"):
+        opened(tmp_path / "a.tif")
+
+
+def test_what_hdf5_keeps_elsewhere_or_makes_of_nothing_is_not_read(tmp_path: Path) -> None:
+    h5 = h5py()
+    secret = hdf5(tmp_path / "secret.h5", depth=WORDS)
+    (tmp_path / "secret.raw").write_bytes(WORDS.tobytes())
+    with h5.File(tmp_path / "a.h5", "w") as file:
+        file["link"] = h5.ExternalLink(secret, "/depth")
+        virtual = h5.VirtualLayout(WORDS.shape, WORDS.dtype)
+        virtual[:] = h5.VirtualSource(secret, "depth", WORDS.shape)
+        file.create_virtual_dataset("virtual", virtual)
+        where = [(str(tmp_path / "secret.raw"), 0, WORDS.nbytes)]
+        file.create_dataset("external", WORDS.shape, WORDS.dtype, external=where)
+        file.create_dataset("text", (2, 3, 4), dtype=h5.string_dtype())
+    for name in (None, "link", "virtual", "external", "text"):
+        with pytest.raises(ToftrackError, match="no array of images.*there is none"):
+            opened(tmp_path / "a.h5", name)
+    with h5.File(tmp_path / "b.h5", "w") as file:
+        file.create_dataset("depth", (10**6, HEIGHT, WIDTH), "u2", chunks=(1, HEIGHT, WIDTH))
+    with pytest.raises(ToftrackError, match="would make 1536 MB of 0 bytes"):
+        opened(tmp_path / "b.h5")
+
+
+def test_a_mat_file_that_would_fill_the_memory_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stacks, "MOST_BYTES", 2**22)
+    packer = zlib.compressobj(9)
+    packed = b"".join(packer.compress(bytes(2**16)) for _ in range(70)) + packer.flush()
+    header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
+    (tmp_path / "a.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
+    with pytest.raises(ToftrackError, match="larger than a gigabyte"):
+        opened(tmp_path / "a.mat")
+
+
+def test_objects_of_a_mat_file_are_no_images(tmp_path: Path) -> None:
+    cells = np.empty((2, 3, 4), object)
+    cells[:] = 1.0
+    with pytest.raises(ToftrackError, match="no array of images"):
+        opened(mat(tmp_path / "a.mat", depth=cells))
+
+
+def test_other_kinds_get_a_sentence_of_their_own_and_unknown_ones_are_no_archives(
+    tmp_path: Path,
+) -> None:
+    for suffix in (*ELSEWHERE, ".foo", ""):
+        path = tmp_path / f"a{suffix}"
+        path.write_bytes(os.urandom(99))
+        with pytest.raises(ToftrackError, match="' is not read") as caught:
+            open_recording(path)
+        assert "archive" not in str(caught.value) or ".zip" in str(caught.value)
+    np.savez(tmp_path / "b.npz", depth_m=METRES, K=np.diag((40, 40, 1)))
+    assert len(open_recording((tmp_path / "b.npz").rename(tmp_path / "b.mine"))) == COUNT

@@ -1,0 +1,379 @@
+"""A folder of depth images, or a `.zip` of one, with a camera file.
+
+| file | content |
+| --- | --- |
+| `*.png`, `*.tif`, `*.exr` | one depth image a frame, grey of 16 bits or floats, by name |
+| `amplitude*.png` | optional: the amplitude images, 16 bits, as many and in the same order |
+| `camera.json` | the camera as `Camera.save` writes it, and more keys, see below |
+| `timestamps.txt` | optional: the frames' times, seconds, a line each |
+
+Images of colours or of 8 bits beside them are left out, and, where names have "depth" in them,
+those that have not. Numbers in names go by value. The images may all lie in one folder of that
+folder.
+
+The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 0.001; of floats,
+1), `radial` (false), `fps` (25), `metadata` (an object).
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import re
+import stat
+import zipfile
+from contextlib import AbstractContextManager
+from pathlib import Path, PurePosixPath
+from typing import IO, Any, Self
+
+import cv2
+import numpy as np
+
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.archives import broken_is_value_error
+from toftrack.files.json_text import parse_json
+from toftrack.files.safe_files import open_new, open_to_read, write_whole
+from toftrack.frames.camera import Camera
+from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, BareFacts, check_metres, is_positive
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of
+from toftrack.recordings.images import decoded_depth, pages_of
+
+_DEPTH, _PICTURES = (".png", ".tif", ".tiff", ".exr"), (".jpg", ".jpeg", ".bmp", ".webp", ".gif")
+_MOST_BYTES = 2**28
+_CAMERA, _TIMES = "camera.json", "timestamps.txt"
+
+
+class Files:
+    """The files of a folder, or of those in it where it has no images itself; as names with `/`."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.what = path, f"the folder '{path}'"
+        with self.reported():
+            here = sorted(path.iterdir())
+            if not any(_is_image(file.name) for file in here):
+                here += [file for folder in here if folder.is_dir() for file in folder.iterdir()]
+        self.names = [file.relative_to(path).as_posix() for file in here]
+
+    def open(self, name: str) -> IO[bytes]:
+        """A file; OSError, or ValueError where it is damaged."""
+        return open_to_read(self.path / name)
+
+    def read(self, name: str) -> bytes:
+        """The content of a file; ToftrackError."""
+        with self.reported(f"'{name}' in {self.what}"), self.open(name) as stream:
+            content = stream.read(_MOST_BYTES + 1)
+            if len(content) > _MOST_BYTES:
+                raise ValueError("it is larger than any camera's image")
+            return content
+
+    def reported(self, what: str = "") -> AbstractContextManager[None]:
+        what = f"{what or self.what} cannot be read"
+        return reported_errors(what, "check it and its permissions", OSError, ValueError)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class ZippedFiles(Files):
+    """Those of a `.zip`, which is refused where it has links, or names that lead out of it."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.what = path, f"the archive '{path}'"
+        self._zip: zipfile.ZipFile | None = None
+        with self.reported():
+            entries = [entry for entry in self._opened().infolist() if not entry.is_dir()]
+            self.names = [entry.filename for entry in entries]
+            for entry in entries:
+                parts = entry.filename.replace("\\", "/").split("/")
+                if ".." in parts or not parts[0] or ":" in parts[0]:
+                    raise ValueError(f"its name '{entry.filename}' leads out of it")
+                if stat.S_ISLNK(entry.external_attr >> 16):
+                    raise ValueError(f"'{entry.filename}' is a link")
+            if len(set(self.names)) < len(self.names):
+                raise ValueError("it has two files of one name")
+
+    def open(self, name: str) -> IO[bytes]:
+        with broken_is_value_error():
+            entry = self._opened().getinfo(name)
+            if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError("its compression is not read; zip it in the usual way")
+            return self._opened().open(entry)
+
+    def read(self, name: str) -> bytes:
+        with self.reported(f"'{name}' in {self.what}"), broken_is_value_error():
+            content = super().read(name)
+            if len(content) != self._opened().getinfo(name).file_size:
+                raise ValueError("it is shorter than the archive says")
+            return content
+
+    def _opened(self) -> zipfile.ZipFile:
+        if self._zip is None:
+            with broken_is_value_error():
+                self._zip = zipfile.ZipFile(self.path)
+        return self._zip
+
+    def close(self) -> None:
+        if self._zip is not None:
+            self._zip.close()
+        self._zip = None
+
+
+class ImageFolder(FrameStore):
+    """The frames of a folder, read from the disk one at a time. Raises ToftrackError where
+    `stated`, the content of the folder's `camera.json`, makes no sense.
+    """
+
+    unit_m: float
+
+    def __init__(
+        self,
+        files: Files,
+        depth: list[str],
+        amplitude: list[str],
+        camera: Camera,
+        stated: dict[str, Any],
+        bare: BareFacts,
+        first: np.ndarray,
+    ) -> None:
+        self.camera, path = camera, f"{_CAMERA} of {files.what}"
+        self._files, self._depth, self._amplitude, self._kind = files, depth, amplitude, first.dtype
+        self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
+        if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
+            raise ToftrackError(f"in {path}, radial must be true or false, and metadata an object")
+        whole = first.dtype == np.uint16
+        unit_m = bare.unit_m or stated.get("depth_unit_m", MILLIMETRE if whole else 1.0)
+        fps = bare.fps or stated.get("fps", DEFAULT_FPS)
+        for name, value in (("depth_unit_m", unit_m), ("fps", fps)):
+            if not is_positive(value):
+                raise ToftrackError(f"{name} must be a positive number, but is {value!r} ({path})")
+        self.unit_m, self.fps = float(unit_m), float(fps)
+        times_s = _timestamps(files, depth)
+        self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
+
+    def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
+        depth = self._read(self._depth[index], self._kind).astype(np.float32)
+        depth *= np.float32(self.unit_m)
+        depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
+        amplitude = self._amplitude and self._read(self._amplitude[index], np.dtype(np.uint16))
+        return depth, amplitude if isinstance(amplitude, np.ndarray) else None
+
+    def close(self) -> None:
+        self._files.close()
+
+    def _read(self, name: str, kind: np.dtype) -> np.ndarray:
+        image = _decoded(self._files, name)
+        if image.shape != (self.camera.height, self.camera.width) or image.dtype != kind:
+            raise ToftrackError(
+                f"the image '{name}' in {self._files.what} is {image.shape[1]}x{image.shape[0]} of "
+                f"{image.dtype}, but must be {self.camera.width}x{self.camera.height} of {kind}, "
+                "like the others"
+            )
+        return image
+
+
+def read_image_folder(
+    folder: str | Path,
+    camera_file: str | Path | None = None,
+    bare: BareFacts = NOTHING_GIVEN,
+) -> ImageFolder:
+    """Open a folder of depth images, or a `.zip`: the first image is checked, the others stay where
+    they are.
+
+    camera_file: instead of the folder's `camera.json`.  bare: what is given goes before what
+    `camera.json` says; the unit is else 0.001 (of floats 1), fps 25. Raises ToftrackError: there is
+    no folder, depth image or camera, or the first image is damaged, or of another size than the
+    camera's; later, another one.
+    """
+    folder = Path(folder).expanduser()
+    zipped = folder.suffix.lower() == ".zip" and not folder.is_dir()
+    if not zipped and not folder.is_dir():
+        raise ToftrackError(f"there is no folder '{folder}'; give a folder of depth images")
+    files = ZippedFiles(file_of(folder)) if zipped else Files(folder)
+    depth, amplitude, left_out = _sorted_out(files)
+    if amplitude and len(amplitude) != len(depth):
+        raise ToftrackError(
+            f"{files.what} has {len(depth)} depth and {len(amplitude)} amplitude images; "
+            "there must be as many of both, or no amplitude"
+        )
+    first = _decoded(files, depth[0])
+    height, width = first.shape
+    content, found = {}, _beside(files, depth[0], _CAMERA)
+    if found is not None:
+        what = f"the camera file '{found}' in {files.what} cannot be read"
+        with reported_errors(what, "write it anew (docs/formats.md)", ValueError):
+            content = parse_json(files.read(found).decode("utf-8"))
+        if not isinstance(content, dict):
+            raise ToftrackError(f"'{found}' in {files.what} is not a camera file")
+    if camera_file is not None:
+        camera = Camera.load(camera_file)
+    elif configured := bare.camera(width, height):
+        camera = configured
+    elif found is not None:
+        camera = Camera.from_dict(content, folder / found)
+    else:
+        raise ToftrackError(
+            f"{files.what} has no {_CAMERA}; put the camera's file there (docs/formats.md "
+            "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
+            "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
+        )
+    if (width, height) != (camera.width, camera.height):
+        raise ToftrackError(
+            f"the image '{depth[0]}' in {files.what} has {width}x{height} pixels, but the camera "
+            f"has {camera.width}x{camera.height}; give the camera of these images"
+        )
+    store = ImageFolder(files, depth, amplitude, camera, content, bare, first)
+    store.left_out = left_out
+    if first.dtype != np.uint16:
+        remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
+        check_metres(store.image(0)[0], f"the image '{depth[0]}' in {files.what}", remedy)
+    return store
+
+
+def _is_image(name: str) -> bool:
+    return PurePosixPath(name).suffix.lower() in (*_DEPTH, *_PICTURES)
+
+
+def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
+    """Depth and amplitude images, and what else there is, in words; ToftrackError where no depth is
+    to be told from the rest."""
+    images = sorted(
+        (n for n in files.names if _is_image(n) and not PurePosixPath(n).name.startswith(".")),
+        key=_order,
+    )
+    grey = [name for name in images if not _surely_no_depth(files, name)]
+    amplitude = [n for n in grey if PurePosixPath(n).name.lower().startswith("amplitude")]
+    depth = [name for name in grey if name not in set(amplitude)]
+    # Infrared has 16 bits, too.
+    depth = [name for name in depth if "depth" in name.lower()] or depth
+    others = sorted(set(images) - {*depth, *amplitude}, key=_order)
+    if not depth:
+        there = f"; '{others[0]}' is a picture of colours or of 8 bits" if others else ""
+        raise ToftrackError(
+            f"{files.what} has no depth image (grey of 16 bits, *.png or *.tif, or floats, *.tif or"
+            f" *.exr){there}; choose another"
+        )
+    folders = sorted({str(PurePosixPath(name).parent) for name in depth})
+    if len(folders) > 1:
+        raise ToftrackError(
+            f"{files.what} has images in {len(folders)} folders, {', '.join(folders[:5])}; give "
+            "one of them" + (" by itself" if isinstance(files, ZippedFiles) else "")
+        )
+    if not others:
+        return depth, amplitude, None
+    return (
+        depth,
+        amplitude,
+        (
+            f"{len(others)} images that are not depth, as '{others[0]}', are left out; depth are "
+            f"'{depth[0]}' and {len(depth) - 1} others"
+        ),
+    )
+
+
+def _surely_no_depth(files: Files, name: str) -> bool:
+    """By what it says of itself; what is damaged is told when its turn comes."""
+    if PurePosixPath(name).suffix.lower() in _PICTURES:
+        return True
+    try:
+        with broken_is_value_error(), files.open(name) as stream:
+            pages = pages_of(stream)
+    except (OSError, ValueError):
+        return False
+    return bool(pages) and not pages[0].is_depth
+
+
+def _decoded(files: Files, name: str) -> np.ndarray:
+    what = f"the image '{name}' in {files.what} cannot be used"
+    with reported_errors(what, "copy or record it again", ValueError):
+        return decoded_depth(files.read(name))
+
+
+def _beside(files: Files, image: str, name: str) -> str | None:
+    """A file in the folder of an image, or in those around it."""
+    places = (str(parent / name) for parent in PurePosixPath(image).parents)
+    return next((place for place in places if place in files.names), None)
+
+
+class PngFolderWriter:
+    """Writes a folder that `read_image_folder` reads; use it with `with`.
+
+    folder: made when it does not exist; must not contain PNG images.  unit_m: metres of one step of
+    the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
+    ToftrackError: the folder cannot be written or is in use.
+    """
+
+    def __init__(
+        self,
+        folder: str | Path,
+        camera: Camera,
+        unit_m: float = 0.001,
+        radial: bool = False,
+        fps: float = DEFAULT_FPS,
+        metadata: dict[str, Any] | None = None,
+    ) -> None:
+        self.folder, self.unit_m, self.frames = Path(folder).expanduser(), unit_m, 0
+        facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
+        with self._writing():
+            self.folder.mkdir(parents=True, exist_ok=True)
+            if any(self.folder.glob("*.png")):
+                raise ToftrackError(
+                    f"the folder '{self.folder}' contains PNG images already; choose an empty one"
+                )
+            text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
+            write_whole(self.folder / _CAMERA, text)
+            self._times = io.TextIOWrapper(
+                open_new(self.folder / _TIMES, replace=True), encoding="utf-8"
+            )
+
+    def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
+        """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and
+        the (H, W) uint16 amplitude. Raises ToftrackError when it cannot be written."""
+        valid = (depth_m > 0) & (depth_m < np.inf)
+        steps = np.where(valid, depth_m, 0).astype(np.float64) / self.unit_m
+        words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
+        with self._writing():
+            self._save(f"depth_{self.frames:06d}.png", words)
+            if amplitude is not None:
+                self._save(f"amplitude_{self.frames:06d}.png", amplitude)
+            self._times.write(f"{timestamp_s!r}\n")
+        self.frames += 1
+
+    def close(self) -> None:
+        with self._writing():
+            self._times.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def _save(self, name: str, image: np.ndarray) -> None:
+        with open_new(self.folder / name) as stream:
+            stream.write(cv2.imencode(".png", image)[1].tobytes())
+
+    def _writing(self) -> AbstractContextManager[None]:
+        what = f"the folder '{self.folder}' cannot be written"
+        return reported_errors(what, "choose another place")
+
+
+def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
+    path = _beside(files, depth[0], _TIMES)
+    if path is None:
+        return None
+    what, remedy = f"'{path}' in {files.what} cannot be read", "it must be one number a line"
+    with reported_errors(what, remedy, ValueError):
+        times = np.array([float(word) for word in files.read(path).decode("utf-8").split()])
+    count = len(depth)
+    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
+        raise ToftrackError(
+            f"'{path}' in {files.what} must hold {count} finite times, one for each depth image, "
+            "that do not go backwards; repair or remove it"
+        )
+    return times
+
+
+def _order(name: str) -> list[tuple[int, int, str]]:
+    """Sorts names with numbers in them by value: 2 before 10."""
+    parts = re.findall(r"\d+|\D+", name)
+    return [(0, int(p), p) if p.isdecimal() else (1, 0, p) for p in parts]

@@ -1,0 +1,239 @@
+"""Stacks of bare depth images in one file: `.npy`, `.tif`, `.h5` and `.mat`.
+
+Frames come first where a program keeps the last axis together (NumPy, HDF5), and last in MATLAB;
+the camera, where it tells another size of the images, decides.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.files.archives import MOST_BYTES
+from toftrack.files.safe_files import open_to_read
+from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_metres, size_of
+from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
+from toftrack.recordings.images import pages_of
+
+_PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
+"""Which axes are frames, rows and columns; the last is MATLAB's as HDF5 sees it."""
+_COMPRESSED = 15
+"""Of the kinds of elements in a `.mat`."""
+_MOST_RATIO, _SMALL_BYTES, _MOST_CHUNK_BYTES = 1000, 2**26, 2**28
+"""As in `archives`: what shrank more was made to fill memories."""
+
+
+class Stack(FrameStore):
+    """The frames of a stack, from the disk as long as this object lives. Made by `read_stack`.
+
+    images: three axes of numbers.  order: which of them are frames, rows and columns.
+    """
+
+    def __init__(
+        self, path: Path, images: Any, order: tuple[int, ...], camera_file: Any, bare: BareFacts
+    ) -> None:
+        count, height, width = (images.shape[axis] for axis in order)
+        self.camera = bare_camera(path, camera_file, bare, width, height)
+        self.unit_m = bare.unit_m or (MILLIMETRE if images.dtype.kind in "ui" else 1.0)
+        self.fps = bare.fps or DEFAULT_FPS
+        self.timestamp_s = np.arange(count) / self.fps
+        self.metadata = {} if bare.dataset is None else {"dataset": bare.dataset}
+        self.path, self._images, self._order = path, images, order
+        some = [self.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
+        remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
+        check_metres(np.stack(some), f"'{path}'", remedy)
+
+    def image(self, index: int) -> tuple[np.ndarray, None]:
+        at: list[Any] = [slice(None)] * 3
+        at[self._order[0]] = index
+        with _reported(self.path, f"frame {index} of "):
+            image = np.asarray(self._images[tuple(at)])
+        depth = image.astype(np.float32) * np.float32(self.unit_m)
+        depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
+        return (depth.T.copy() if self._order[1] > self._order[2] else depth), None
+
+    def close(self) -> None:
+        if isinstance(self._images, _Hdf5):
+            self._images.close()
+
+
+def read_stack(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> Stack:
+    """Open a stack, whose kind follows from its name.
+
+    camera_file: None = the given intrinsics, or camera.json beside the file.  bare: intrinsics,
+    unit of whole numbers (a millimetre) and frame rate (25) where given, and the name of the
+    dataset in a `.h5` or `.mat` that has several. Raises ToftrackError: it is no such stack,
+    damaged, holds pickled objects, or nothing tells its camera.
+    """
+    path = file_of(path)
+    images, order = _OPENED[path.suffix.lower()](path, bare.dataset)
+    if len(images.shape) != 3 or 0 in images.shape or images.dtype.kind not in "uif":
+        raise ToftrackError(
+            f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth images, "
+            "(frames, rows, columns) of numbers"
+        )
+    size = None if images.shape[0] == 1 else size_of(path, camera_file, bare)
+    if size is not None and path.suffix.lower() in DATASETS:
+
+        def misfit(order: tuple[int, ...]) -> float:
+            height, width = (images.shape[axis] for axis in order[1:])
+            return float(np.abs(np.log((width, height) / size)).sum())
+
+        order = min(order, _PYTHONS, _MATLABS, _REVERSED, key=misfit)
+    return Stack(path, images, order, camera_file, bare)
+
+
+@contextmanager
+def _reported(path: Path, what: str = "") -> Iterator[None]:
+    """Whatever a library says of a damaged file becomes one sentence; they raise all kinds."""
+    try:
+        with reading(path):
+            yield
+    except ToftrackError:
+        raise
+    except Exception as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ToftrackError(
+            f"{what}'{path}' cannot be read ({reason}); it is damaged, or of another kind"
+        ) from error
+
+
+def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
+    with _reported(path):
+        images = np.load(path, mmap_mode="r", allow_pickle=False)
+    return (images[None] if images.ndim == 2 else images), _PYTHONS
+
+
+class _Tiff:
+    """The images of a TIFF; as an array of three axes."""
+
+    def __init__(self, path: Path) -> None:
+        with _reported(path), open_to_read(path) as stream:
+            pages = pages_of(stream)
+            if not pages or not pages[0].is_depth or len(set(pages)) > 1:
+                raise ValueError("its images are not grey, of one size, and of 16 bits or floats")
+        self._path = path
+        self.shape = (len(pages), pages[0].height, pages[0].width)
+        self.dtype = np.dtype(pages[0].kind)
+
+    def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
+        _, found = cv2.imreadmulti(str(self._path), int(at[0]), 1, flags=cv2.IMREAD_UNCHANGED)
+        if len(found) != 1 or found[0].shape != self.shape[1:]:
+            raise ValueError("OpenCV cannot decode it")
+        return found[0]
+
+
+def _chosen(path: Path, wanted: str | None, there: dict[str, tuple[int, ...]]) -> str:
+    """The dataset of that name, or the only one; ToftrackError, with those there are."""
+    names = [n for n in there if wanted is None or n.strip("/") == wanted.strip("/")]
+    if len(names) == 1:
+        return names[0]
+    listed = ", ".join(f"{name} {shape}" for name, shape in list(there.items())[:12])
+    which = "several arrays of images" if wanted is None else f"no array of images '{wanted}'"
+    raise ToftrackError(
+        f"'{path}' has {which if there else 'no array of images'}; choose one with "
+        f"device.dataset=NAME (toftrack convert: --dataset): {listed or 'there is none'}"
+    )
+
+
+class _Hdf5:
+    """A dataset of an HDF5 file, as an array of three axes; it is opened when it is needed."""
+
+    def __init__(self, path: Path, wanted: str | None) -> None:
+        self._h5py: Any = module_of_extra("h5py", f"'{path}' is read by h5py", "hdf5")
+        self._path, self._file = path, None
+        there: dict[str, Any] = {}
+
+        def note(name: str, found: Any) -> None:
+            # Hard links only: nothing outside of this file is opened.
+            if isinstance(found, self._h5py.Dataset) and not (found.is_virtual or found.external):
+                if found.dtype.kind in "uif" and len(found.shape or ()) in (2, 3):
+                    there[name] = found.shape
+
+        with _reported(path):
+            self._file = self._h5py.File(path, "r")
+            self._file.visititems(note)
+            self._name = _chosen(path, wanted, there)
+            found = self._file[self._name]
+            stored, chunk = found.id.get_storage_size(), math.prod(found.chunks or (1,))
+            if found.nbytes > max(_SMALL_BYTES, _MOST_RATIO * stored) or (
+                max(chunk, math.prod(found.shape[-2:])) * found.dtype.itemsize > _MOST_CHUNK_BYTES
+            ):
+                raise ValueError(f"it would make {found.nbytes / 1e6:.0f} MB of {stored} bytes")
+            self.shape = (1, *found.shape)[-3:]
+            self.dtype = found.dtype
+
+    def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
+        if self._file is None:
+            self._file = self._h5py.File(self._path, "r")
+        found = self._file[self._name]
+        return found[at[-found.ndim :]]
+
+    def close(self) -> None:
+        if self._file is not None:
+            self._file.close()
+        self._file = None
+
+
+def _hdf5(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
+    return _Hdf5(path, wanted), _REVERSED if path.suffix.lower() == ".mat" else _PYTHONS
+
+
+def _mat(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
+    with reading(path), open_to_read(path) as stream:
+        if stream.read(10) == b"MATLAB 7.3":
+            return _hdf5(path, wanted)
+    from scipy.io import loadmat, whosmat
+
+    with _reported(path):
+        _check_unpacked(path)
+        numbers = ("double", "single", *(f"{s}int{n}" for s in ("", "u") for n in (8, 16, 32, 64)))
+        there = {
+            name: shape
+            for name, shape, kind in whosmat(str(path))
+            if kind in numbers and len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
+        }
+        name = _chosen(path, wanted, there)
+        if 8 * math.prod(there[name]) > MOST_BYTES:
+            raise ValueError("it is larger than a gigabyte: save it with -v7.3")
+        images = np.asarray(loadmat(str(path), variable_names=[name])[name])
+    return (images[None], _PYTHONS) if images.ndim == 2 else (images, _MATLABS)
+
+
+def _check_unpacked(path: Path) -> None:
+    """ValueError where a compressed variable is larger than anything that is read: SciPy makes
+    room for what its header claims."""
+    with open_to_read(path) as stream:
+        order = "<" if stream.read(128)[126:] == b"IM" else ">"
+        while len(tag := stream.read(8)) == 8:
+            kind, size = struct.unpack(order + "II", tag)
+            end, unpacked, unpack = stream.tell() + size, 0, zlib.decompressobj()
+            while kind == _COMPRESSED and (piece := stream.read(min(2**20, end - stream.tell()))):
+                while piece:
+                    unpacked += len(unpack.decompress(piece, 2**20))
+                    piece = unpack.unconsumed_tail
+                if unpacked > MOST_BYTES:
+                    raise ValueError("a variable is larger than a gigabyte: save it with -v7.3")
+            stream.seek(end)
+
+
+_OPENED = {
+    ".npy": _npy,
+    ".tif": lambda path, _: (_Tiff(path), _PYTHONS),
+    ".tiff": lambda path, _: (_Tiff(path), _PYTHONS),
+    ".h5": _hdf5,
+    ".hdf5": _hdf5,
+    ".mat": _mat,
+}
+DATASETS = (".h5", ".hdf5", ".mat")
+"""How the names of files end that may hold several arrays."""
+STACKS = frozenset(_OPENED)
