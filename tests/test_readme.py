@@ -28,6 +28,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
+from scipy.io import savemat
 
 from toftrack.api import make_device
 from toftrack.devices.replay import Sample
@@ -182,6 +183,7 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     (folder / "pictures" / "camera.json").rename(folder / "camera.json")
     words = np.rint(1000 * whole.depth[:4].astype(np.float32)).astype(np.uint16)
     np.save(folder / "depth.npy", words)
+    savemat(folder / "depth.mat", {"depths": words.transpose(1, 2, 0)})
     write_grey(folder / "depth.mkv", words)
     return {path.name: path for path in folder.iterdir()}
 
