@@ -125,11 +125,15 @@ def test_every_command_is_of_a_program_that_there_is() -> None:
 
 @pytest.mark.parametrize("words", TRACK + TRAIN, ids=" ".join)
 def test_a_command_composes(words: tuple[str, ...]) -> None:
-    if "--config-dir" in words:  # a folder of the reader's own
-        assert OverridesParser.create().parse_overrides(list(words[4:]))
-        return
-    name = "config" if words[1] == "track.py" else "train_pose_space"
-    assert configuration(*overrides_of(words), name=name)
+    name, own = "config" if words[1] == "track.py" else "train_pose_space", ()
+    if "--config-dir" in words:
+        at = words.index("--config-dir")
+        folder, words = ROOT / words[at + 1], words[:at] + words[at + 2 :]
+        if not folder.is_dir():  # the reader's own
+            assert OverridesParser.create().parse_overrides(list(words[2:]))
+            return
+        own = (f"hydra.searchpath=[file://{folder}]",)
+    assert configuration(*own, *overrides_of(words), name=name)
 
 
 def test_the_command_that_trains_networks_is_shown_and_composes() -> None:

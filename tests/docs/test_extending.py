@@ -7,16 +7,21 @@ import importlib
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from helpers import programs
-from helpers.tracking import ROOT
+from helpers.tracking import ROOT, sample
 from hydra.core.config_store import ConfigStore
 from hydra.utils import instantiate
 
@@ -232,3 +237,113 @@ def test_pose_spaces_without_a_class_are_not_trained(tmp_path: Path) -> None:
     given = ("--config-dir", "my_conf", "pose_space=own")
     status, _, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
     assert status == 1 and "pose_space._target_=mine.make cannot be learned here" in err
+
+
+def test_distances_of_points_from_an_ellipsoid_are_exact_on_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.syspath_prepend(EXAMPLES)
+    distances = importlib.import_module("point_to_surface").distances
+    axes_m = torch.diag(torch.tensor([0.02, 0.05, 0.01]))[None, None]
+    centre_m = torch.tensor([[[0.1, 0.0, 0.5]]])
+    points_m = centre_m[0] + torch.tensor([[0.02, 0, 0], [0, 0, -0.01], [0, 0.053, 0], [0, 0, 0]])
+    found = distances(points_m, centre_m, axes_m)[0]
+    assert torch.allclose(found[:3], torch.tensor([0.0, 0.0, 0.003]), atol=1e-6)
+    assert 0.005 < found[3] < 0.05, "the middle is inside"
+
+
+def test_the_point_to_surface_likelihood_prefers_the_true_pose(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    overrides = ("likelihood=point_to_surface", "experiment=paper", "hand.side=right")
+    tracker = toftrack.make_tracker(*overrides, "gestures=none", config_dir=EXAMPLES)
+    scene = sample()
+    for index in range(3):
+        estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
+    assert type(tracker.model.likelihood).__name__ == "PointToSurface"
+    assert 1e3 * np.linalg.norm(estimate.joints_m - scene.joints_m[2], axis=1).mean() < 25
+
+
+@pytest.fixture
+def camera(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., int]]:
+    """Starts a sender of given bytes, or the example's own of a recording; its port."""
+    monkeypatch.syspath_prepend(EXAMPLES)
+    serve, threads = importlib.import_module("socket_camera").serve, []
+
+    def start(*sent: bytes, recording: Path | None = None) -> int:
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            port = int(free.getsockname()[1])
+
+        def send() -> None:
+            with socket.create_server(("127.0.0.1", port)) as server:
+                listening.set()
+                connection, _ = server.accept()
+                with connection:
+                    for part in sent:
+                        connection.sendall(part)
+                    ended.wait(10)
+
+        listening = threading.Event()
+        target = send if recording is None else partial(serve, recording, port)
+        threads.append(threading.Thread(target=target, daemon=True))
+        threads[-1].start()
+        if recording is None:
+            listening.wait(10)
+        return port
+
+    ended = threading.Event()
+    yield start
+    ended.set()
+    for thread in threads:
+        thread.join(10)
+
+
+def test_the_camera_behind_a_socket_is_tracked(mine: Path, camera: Callable[..., int]) -> None:
+    images = np.stack([frame.depth for frame in Sample(stop=FRAMES)])
+    np.savez(mine / "hand.npz", depth_m=images, K=Sample().camera.K, fps=10.0)
+    port = camera(recording=mine / "hand.npz")
+    overrides, seen = ("device=socket", f"device.port={port}"), []
+    for _ in range(100):  # until it listens
+        with suppress(ToftrackError):
+            camera_there = toftrack.make_device(*overrides, config_dir=EXAMPLES)
+            break
+        time.sleep(0.05)
+    with camera_there as device:
+        assert device.live and device.fps == 10
+        for frame in device:
+            seen.append(frame.index)
+            np.testing.assert_allclose(frame.depth, images[frame.index], atol=6e-4)
+    assert seen[-1] == FRAMES - 1 and len(seen) + device.dropped == FRAMES
+
+
+ABOUT = b'{"width": 4, "height": 3, "K": [[9,0,2],[0,9,1],[0,0,1]], "unit_m": 0.001, "fps": 9}\n'
+
+
+@pytest.mark.parametrize(
+    ("sent", "words"),
+    [
+        (None, "no camera at 127.0.0.1 port 1 "),
+        ([b"\x00\xff garbage\n"], "begins with no line that describes it"),
+        ([ABOUT.replace(b"4", b"-4")], "begins with no line that describes it"),
+        ([b"1" * 20_000], "begins with no line that describes it"),
+        ([ABOUT, b"\0" * 5], "sent nothing for 0.2 s"),
+    ],
+)
+def test_what_a_socket_sends_wrongly_is_one_sentence(
+    sent: list[bytes] | None, words: str, camera: Callable[..., int]
+) -> None:
+    port = 1 if sent is None else camera(*sent)
+    overrides = ("device=socket", f"device.port={port}", "device.timeout_s=0.2")
+    with pytest.raises(ToftrackError) as caught:
+        with toftrack.make_device(*overrides, config_dir=EXAMPLES) as device:
+            next(iter(device))
+    assert words in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.slow
+def test_the_examples_have_strict_types() -> None:
+    pytest.importorskip("mypy")
+    files = sorted(path.name for path in EXAMPLES.glob("*.py"))
+    command = [sys.executable, "-m", "mypy", "--strict", *files]
+    done = subprocess.run(command, cwd=EXAMPLES, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout

@@ -78,7 +78,7 @@ class Autoencoder(PoseSpace):
             shaken = angles + _NOISE_RAD * torch.randn(angles.shape, generator=dice)
             off = space.decode_freely(space.encode(shaken)) - angles
             learner.zero_grad()
-            off.square().mean().backward()
+            torch.autograd.backward(off.square().mean())
             learner.step()
             schedule.step()
         learned = [weight.detach() for weight in weights]

@@ -76,7 +76,7 @@ def distances(points_m: Tensor, centres_m: Tensor, axes_m: Tensor) -> Tensor:
     square = axes_m.square().sum(2)[:, :, None]  # (N, E, 1, 3), of the semi-axes
     away = points_m - centres_m[:, :, None]  # (N, E, P, 3)
     unit = away @ axes_m / square  # on the unit sphere where a point is on the surface
-    radius = unit.norm(dim=-1).clamp(min=1e-3)
-    slope = (unit.square() / square).sum(-1).sqrt().clamp(min=1e-3)
+    parts = unit.square() + 1e-6  # the middle has a way out, too
+    radius, slope = parts.sum(-1).sqrt(), (parts / square).sum(-1).sqrt()
     signed: Tensor = (radius - 1) * radius / slope
     return signed.amin(1).abs()  # to the nearest ellipsoid; within one, to the way out
