@@ -221,7 +221,7 @@ def rewrite(path: Path, header: dict, **arrays: np.ndarray | None) -> None:
     [
         ({"version": 99}, {}, "version 99"),
         ({"format": "other"}, {}, "not a pose-space file"),
-        ({"kind": "hologram"}, {}, "unknown kind 'hologram'; known: isomap"),
+        ({"kind": "hologram"}, {}, "the kind 'hologram', which is not there; there are isomap"),
         ({"angle_names": ["a", "b"]}, {}, "other joint angles"),
         ({"training_labels": ["palm"]}, {}, "bounds or labels do not fit"),
         ({}, {"mean": None}, "no array 'mean'"),
