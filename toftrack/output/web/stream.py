@@ -71,7 +71,8 @@ class WebSocketStream(Stream):
             self._server.call(self._offer, json_line(estimates, self._fields))
 
     def __exit__(self, *exception: Any) -> None:
-        self.dropped += self._server.close()
+        left = self._server.close()  # until then its thread counts, too
+        self.dropped += left
         self.report(f"to clients of {self.url}", "a client was too slow")
 
     def _offer(self, line: str) -> None:
