@@ -168,22 +168,23 @@ def decoded_depth(content: bytes) -> np.ndarray:
 
 
 def _decoded_exr(content: bytes) -> np.ndarray:
-    exr = module_of_extra("OpenEXR", "EXR images are read by OpenEXR", "exr")
-    numbers = module_of_extra("Imath", "EXR images are read by OpenEXR", "exr")
-    kind = numbers.PixelType(numbers.PixelType.FLOAT)
+    # Not by its older InputFile, which damaged files crash.
+    library = module_of_extra("OpenEXR", "EXR images are read by OpenEXR", "exr")
     try:
-        file = exr.InputFile(io.BytesIO(content))
-        window, channels = file.header()["dataWindow"], file.header()["channels"]
-        width, height = window.max.x - window.min.x + 1, window.max.y - window.min.y + 1
+        header = library.File(io.BytesIO(content), header_only=True).header()
+        low, high = header["dataWindow"]
+        width, height = (int(value) for value in high.astype(np.int64) - low + 1)
         if min(width, height) < 1 or width * height > LARGEST_PIXELS:
             raise ValueError("it is damaged, or larger than any camera's image")
-        same = _depth_channels(list(channels))
-        read = [np.frombuffer(file.channel(name, kind), np.float32) for name in same]
-        if not all(np.array_equal(one, read[0], equal_nan=True) for one in read):
-            raise ValueError("it is of colours")
-        return read[0].reshape(height, width)
+        channels = library.File(io.BytesIO(content), separate_channels=True).channels()
+        read = [channels[name].pixels for name in _depth_channels(list(channels))]
     except (OSError, RuntimeError, TypeError, KeyError, MemoryError) as error:
         raise ValueError(f"it is damaged: {error}") from None
+    if read[0].shape != (height, width):
+        raise ValueError("it is damaged")
+    if not all(np.array_equal(one, read[0], equal_nan=True) for one in read):
+        raise ValueError("it is of colours")
+    return read[0].astype(np.float32)
 
 
 def _depth_channels(names: list[str]) -> list[str]:
