@@ -128,7 +128,8 @@ def _divided(words: Sequence[str], hands: int = 1) -> tuple[list[str], list[str]
     overrides = [word for word in words if "=" in word and not Path(word).exists()]
     for word in overrides:
         key = word.split("=")[0].lstrip("+~")
-        if key == "hand.side" or key.split(".")[0] in _GIVEN_ELSEWHERE:
+        elsewhere = key.split(".")[0] in _GIVEN_ELSEWHERE and key != "hydra.searchpath"
+        if key == "hand.side" or elsewhere:
             raise ToftrackError(
                 f"{word} cannot be given here: recordings are named, with the camera that they "
                 "have, sides, seeds and hands are given by --side, --seeds and --hands, and "

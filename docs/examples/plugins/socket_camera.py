@@ -54,6 +54,7 @@ class SocketCamera(BaseDevice):
                 f"what {self._where} sends begins with no line that describes it ({error!r});"
                 f" {_REMEDY}"
             ) from error
+        self._socket.settimeout(None)  # from here on it is the iteration that waits no longer
         super().__init__(camera, fps, live=True)
         self.description |= {"device": "socket", "where": self._where}
 
