@@ -74,7 +74,8 @@ def commands() -> Iterator[tuple[str, ...]]:
 def with_track_py(words: list[str]) -> tuple[str, ...]:
     """`toftrack track ...` as `python track.py ...`, which does the same."""
     if words[:2] == ["toftrack", "track"]:
-        return ("python", "track.py", *(word for word in words[2:] if not word.startswith("FILE")))
+        words = [re.sub(r"^FILE\..*", "device=replay", word) for word in words[2:]]
+        return ("python", "track.py", *(word for word in words if word != "FILE"))
     return tuple(words)
 
 
