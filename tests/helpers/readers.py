@@ -99,15 +99,14 @@ def read_whole_run(folder: Path) -> None:
     run_there.estimates(len(run_there) - 1)
     run_there.likelihood()
     run_there.segmentation()
-    run_there.found("anything")
 
 
 def read_data_set(name: str) -> Callable[[Path], None]:
     def read(folder: Path) -> None:
         _, sequences = open_data_set(name, folder)
         for sequence in sequences:
-            for number in range(min(len(sequence), _MOST_FRAMES)):
-                sequence.frame(number)
+            for image in sequence.images[:_MOST_FRAMES]:
+                sequence.read(image)
 
     return read
 
