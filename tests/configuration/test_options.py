@@ -93,6 +93,8 @@ def test_every_option_composes_and_can_be_made(
         pytest.importorskip(package, reason=f"pip install '.[{extra}]'")
     if option == "triton":
         pytest.importorskip("triton", reason="triton is not installed")
+        if not torch.cuda.is_available():
+            pytest.skip("there is no CUDA device")
     if option == "realsense":
         pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
     femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.profile("y16")]})
