@@ -8,5 +8,5 @@ COPY conf /src/conf
 RUN pip install --no-cache-dir '/src[figures,export]' && rm -r /src
 WORKDIR /data
 # A first run compiles kernels: now, and they stay in the image.
-RUN toftrack track device.stop=2 hydra.run.dir=/tmp/run && rm -r /tmp/run
+RUN toftrack track device.stop=2 hydra.run.dir=try && rm -r try
 ENTRYPOINT ["toftrack"]
