@@ -367,10 +367,10 @@ _BINS = 10
 _FEWEST = 10
 
 
-def reliability_figure(said: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Observed against said probability of frames that were held out, BGR.
+def reliability_figure(said: np.ndarray, right: np.ndarray, what: str = "held out") -> np.ndarray:
+    """Observed against said probability, BGR.
 
-    said: (N,) probabilities.  right: (N,) whether the estimates were right.
+    said: (N,) probabilities.  right: (N,) whether the estimates were right.  what: they are of.
     """
     figure = chart.new_figure(700, 460)
     axes = figure.subplots()
@@ -380,7 +380,7 @@ def reliability_figure(said: np.ndarray, right: np.ndarray) -> np.ndarray:
     bins = [index == number for number in range(_BINS)]
     bins = [rows for rows in bins if rows.sum() >= _FEWEST]
     means = [[values[rows].mean() for rows in bins] for values in (said, right)]
-    axes.plot(*means, "o-", color=chart.BLUE, label=f"held out ({len(said)})")
+    axes.plot(*means, "o-", color=chart.BLUE, label=f"{what} ({len(said)})")
     axes.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
     figure.legend(loc="outside right upper", frameon=False)
     picture = chart.picture_of(figure)

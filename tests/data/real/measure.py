@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
 """How well the tracker follows the real recordings of this folder.
 
-    python tests/data/real/measure.py RECORDING.npz [...] [--side right] [--seed 0] [KEY=VALUE ...]
+    python tests/data/real/measure.py RECORDING.npz [...] [--picture FILE] [KEY=VALUE ...]
 
 RECORDING.npz is what make_extract.py makes. Of a recording with the truth of every
 joint: usable and silently wrong frames, wrong joints that are not ok, and how often joints are
@@ -19,6 +19,8 @@ import numpy as np
 from toftrack.api import make_hands_tracker
 from toftrack.evaluation.trust import OK_MM, judged, trust
 from toftrack.frames.frame import Truth
+from toftrack.training.fit_confidence import reliability_figure
+from toftrack.views.pictures import write_picture
 
 _JOINTS = slice(2, None)
 _EDGES = (0, 0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
@@ -32,6 +34,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="+", metavar="RECORDING.npz")
     parser.add_argument("--side", default="right", help="right, left or auto (right)")
     parser.add_argument("--seed", default="0", help="of the tracker (0)")
+    parser.add_argument("--picture", type=Path, help="how often joints of a confidence are right")
     asked = parser.parse_args()
     paths = [Path(one) for one in asked.recordings if "=" not in one]
     overrides = [one for one in asked.recordings if "=" in one]
@@ -65,6 +68,9 @@ def main() -> None:
         right.append(~wrong[~lost].ravel())
     if sure:
         _print_reliability(np.concatenate(sure), np.concatenate(right))
+        if asked.picture is not None:
+            of = (np.concatenate(sure), np.concatenate(right), "joints")
+            write_picture(asked.picture, reliability_figure(*of))
 
 
 def _print_reliability(said: np.ndarray, right: np.ndarray) -> None:
