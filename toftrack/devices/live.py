@@ -57,8 +57,9 @@ def chosen_serial(
     listed = ", ".join(sorted(numbers))
     if not numbers:
         raise ToftrackError(
-            f"no {maker} camera was found ({cameras_seen()}): plug it in, into a USB 3 port; on Linux its udev rules "
-            f"must be installed; or replay a recording with device.bag=FILE{otherwise}"
+            f"no {maker} camera was found ({cameras_seen()}): plug it in, into a USB 3 port; on "
+            "Linux its udev rules must be installed; or replay a recording with device.bag=FILE"
+            + otherwise
         )
     if serial is None and len(numbers) > 1:
         raise ToftrackError(

@@ -3,64 +3,45 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Container
+import re
+from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import usb.core
 
-_REALSENSE = (
-    *(0x0A66, 0x0A80, 0x0AA5, *range(0x0AD1, 0x0AD7), 0x0AF6, 0x0AFE, 0x0AFF, 0x0B00, 0x0B01),
-    *(0x0B03, 0x0B07, 0x0B3A, 0x0B3D, 0x0B48, 0x0B49, 0x0B4B, 0x0B4D, 0x0B52, 0x0B5B, 0x0B5C),
-    *(0x0B64, 0x0B68, 0xABCD),
-)
-_ALL = range(0x10000)
-_KNOWN: tuple[tuple[str, str, int, Container[int]], ...] = (
-    ("RealSense", "realsense", 0x8086, _REALSENSE),
-    ("Orbbec", "orbbec", 0x2BC5, _ALL),
-    ("SwissRanger", "sr3000", 0x0852, (0x0074,)),
-    ("SwissRanger", "sr3000", 0x1AD2, (0x0074, 0x0075)),
-    ("Azure Kinect", "", 0x045E, (0x097C,)),
-    ("Kinect V2", "", 0x045E, (0x02C4, 0x02D8)),
-    ("Kinect", "", 0x045E, (0x02AE,)),
-    ("PrimeSense or Xtion", "", 0x1D27, _ALL),
-    ("Luxonis", "", 0x03E7, (0x2485, 0xF63B)),
-    ("Stereolabs", "", 0x2B03, _ALL),
-    ("pmd", "", 0x1C28, _ALL),
-)
-"""The maker, the device of the configuration if there is one, and the USB ids."""
-_SDKS = {"realsense": "RealSense", "orbbec": "Orbbec"}
-"""Devices whose module tells what its SDK lists."""
+_KNOWN = {
+    "RealSense (device=realsense)": "8086:(0a(66|80|a5|d[1-6]|f6|f[ef])|0b(0[0137]|3[ad]|4[89bd])"
+    "|0b(52|5[bc]|6[48])|abcd)",
+    "Orbbec (device=orbbec)": "2bc5:",
+    "SwissRanger (device=sr3000)": "0852:0074|1ad2:007[45]",
+    **{"Azure Kinect": "045e:097c", "Kinect V2": "045e:02(c4|d8)", "Kinect": "045e:02ae"},
+    **{"Luxonis": "03e7:(2485|f63b)", "Stereolabs": "2b03:", "pmd": "1c28:", "PrimeSense": "1d27:"},
+}
+"""Patterns of USB ids."""
 
 
 def cameras_seen(backend: Any = None) -> str:
-    """What is connected, in words, as "seen: Orbbec 2bc5:0670 (device=orbbec)": on USB or, where
-    that cannot be listed, what the SDKs list that are installed; raises nothing.
-
-    backend: of pyusb; None = libusb.
+    """What is connected, in words: on USB or, where that cannot be listed, what the SDKs list that
+    are installed; raises nothing.  backend: of pyusb; None = libusb.
     """
-    seen, unlisted = [], ""
+    unlisted = ""
     try:
-        for one in usb.core.find(find_all=True, backend=backend):
-            vendor, product = one.idVendor, one.idProduct
-            for maker, device, known, products in _KNOWN:
-                if vendor == known and product in products:
-                    seen.append((f"{maker} {vendor:04x}:{product:04x}", device))
-    except usb.core.NoBackendError:
-        unlisted = "; USB cannot be listed without libusb-1.0"
-    except (usb.core.USBError, NotImplementedError) as error:
-        unlisted = f"; USB cannot be listed: {error}"
-    # Loading an SDK takes a second, and one of them greets the user.
-    for device, maker in _SDKS.items() if unlisted else ():
-        seen += [(f"{maker} {number}", device) for number in _listed(device)]
-    words = [f"{name} (device={device})" if device else name for name, device in seen]
-    return f"seen: {', '.join(words)}{unlisted}" if words else f"no depth camera is seen{unlisted}"
+        found = usb.core.find(find_all=True, backend=backend)
+        ids = [f"{one.idVendor:04x}:{one.idProduct:04x}" for one in found]
+        seen = [name for id in ids for name, known in _KNOWN.items() if re.match(known, id)]
+    except (usb.core.NoBackendError, usb.core.USBError, NotImplementedError) as error:
+        unlisted = f"; USB cannot be listed, which needs libusb-1.0 and permission: {error}"
+        seen = list(_by_sdks())
+    return (f"seen: {', '.join(seen)}" if seen else "no depth camera is seen") + unlisted
 
 
-def _listed(device: str) -> list[str]:
-    """The serial numbers that a vendor's SDK lists; none where it is not installed or fails."""
-    try:
-        # By name, because these modules import this one.
-        module = importlib.import_module(f"toftrack.devices.{device}.device")
-        return list(module.listed_serials())
-    except Exception:  # what is said is of another camera
-        return []
+def _by_sdks() -> Iterator[str]:
+    for name, count in (
+        ("realsense", lambda rs: len(rs.context().devices)),
+        ("orbbec", lambda ob: ob.Context().query_devices().get_count()),
+    ):
+        with suppress(Exception):  # whatever it is, the sentence is of another camera
+            # By name, because these modules import this one.
+            sdk = importlib.import_module(f"toftrack.devices.{name}.device").load_sdk()
+            yield from count(sdk) * [next(words for words in _KNOWN if f"={name})" in words)]

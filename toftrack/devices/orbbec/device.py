@@ -216,11 +216,6 @@ def _greeting_elsewhere() -> Iterator[None]:
         os.close(kept)
 
 
-def listed_serials() -> list[str]:
-    """Of the cameras that the SDK lists. Raises ToftrackError, and an error of the SDK's."""
-    return _serials(load_sdk().Context().query_devices())
-
-
 def _serials(devices: Any) -> list[str]:
     """The serial numbers of a list of devices, in its order."""
     count = devices.get_count()

@@ -227,12 +227,6 @@ def _found(rs: ModuleType, serial: str | int | None) -> Any:
     return found[chosen_serial(list(found), serial, "RealSense", otherwise)]
 
 
-def listed_serials() -> list[str]:
-    """Of the cameras that the SDK lists. Raises ToftrackError, and RuntimeError by the SDK."""
-    rs = load_sdk()
-    return [_info(rs, device, "serial_number") for device in rs.context().devices]
-
-
 def _facts(rs: ModuleType, device: Any) -> dict[str, Any]:
     """What the camera says of itself, JSON-able."""
     names = {"model": "name", "serial": "serial_number", "firmware": "firmware_version"}
