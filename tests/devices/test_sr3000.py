@@ -204,7 +204,9 @@ def test_no_camera_and_no_library_are_reported_with_the_ids(
     def no_library(**_: Any) -> None:
         raise usb.core.NoBackendError("No backend available")
 
-    with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*plug.*libmesasr.*emulated"):
+    with pytest.raises(
+        ToftrackError, match="1ad2:0074.*no depth camera is seen.*plug.*libmesasr.*emulated"
+    ):
         camera("missing")
     monkeypatch.setattr(sr3000_usb.usb.core, "find", no_library)
     with pytest.raises(ToftrackError, match="0852:0074, 1ad2:0074.*libusb.*libmesasr.*emulated"):

@@ -20,6 +20,8 @@ from helpers.browsing import (
     eventually,
     made,
     moments,
+    numbered,
+    numbers_of,
     ours,
     shown_again_and_again,
 )
@@ -48,6 +50,9 @@ def visitor(view: BrowserView) -> Iterator[Visitor]:
 
 def test_the_picture_is_the_overlay_of_the_newest_frame(view, visitor) -> None:
     first, second = moments()
+    ok = np.arange(21) > 1
+    second = with_hand(second, estimate=replace(second.estimates[0], joint_ok=ok))
+    second = replace(second, dropped=5)
     view.show(first)
     view.show(second)
     facts, body = visitor.picture()
@@ -64,7 +69,17 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view, visitor) -> None:
     assert facts["gesture"] == estimate.gesture and facts["side"] == "right"
     assert facts["pinch"] == pytest.approx(estimate.pinch, abs=1e-3)
     assert facts["pinching"] == estimate.pinching
+    assert (facts["doubted"], facts["dropped"]) == (["wrist", "thumb_cmc"], 5)
     assert facts["ms"] == pytest.approx(1e3 * estimate.compute_s, abs=1e-3)
+
+
+def test_image_skeleton_and_facts_are_of_one_frame_though_the_device_reuses_its_memory(
+    view, visitor
+) -> None:
+    with shown_again_and_again(view, numbered):
+        seen = [visitor.picture() for _ in range(8)]
+    for facts, body in seen:
+        assert numbers_of(body) == 2 * ((facts["index"] - 1) % 8,)
 
 
 def test_pictures_follow_one_another_and_none_comes_twice(view, visitor) -> None:
@@ -77,6 +92,10 @@ def test_pictures_follow_one_another_and_none_comes_twice(view, visitor) -> None
     with pytest.raises(TimeoutError):
         visitor.socket.recv(0.2)
     with Visitor(view.url) as other:  # who comes later sees the newest one at once
+        assert other.first == {
+            "phase": "live",
+            "picture": False,
+        }  # of a frame with its picture only
         assert other.picture()[1] == bodies[-1]
 
 

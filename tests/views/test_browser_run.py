@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import re
 import sys
@@ -23,6 +24,8 @@ from helpers.browsing import (
     eventually,
     made,
     moments,
+    numbered,
+    numbers_of,
     ours,
     shown_again_and_again,
 )
@@ -149,6 +152,22 @@ def view() -> Iterator[BrowserView]:
         yield view
 
 
+def test_the_page_shows_image_skeleton_and_number_of_one_frame(chromium, view) -> None:
+    found = "document.getElementById"
+    script = f"return [{found}('image').toDataURL(), {found}('index').textContent]"
+    seen = set()
+    with shown_again_and_again(view, numbered):
+        chromium.get(view.url)
+        eventually(lambda: chromium.execute_script(script)[1] != "–")
+        for _ in range(12):
+            url, index = chromium.execute_script(script)
+            assert numbers_of(base64.b64decode(url.partition(",")[2])) == 2 * (
+                (int(index) - 1) % 8,
+            )
+            seen.add(index)
+    assert len(seen) > 1
+
+
 def test_the_page_works_in_a_browser(chromium, view) -> None:
     def text(name: str) -> str:
         return chromium.execute_script(f"return document.getElementById('{name}').textContent")
@@ -190,8 +209,9 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         eventually(lambda: taken[2:] == ["auto"] and pressed() == ["Either hand"])
         assert text("latency").endswith(" ms")
 
-        for width in (1200, 500):
-            chromium.set_window_size(width, 900)
+        for width in (1400, 500, 400):  # the last one is a phone's
+            size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width == 400}
+            chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
             wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert chromium.execute_script(f"return {wide}") <= 0
             clipped = "return [...document.querySelectorAll('dd, #phase')].filter(shown => shown"
@@ -201,11 +221,12 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
             rest = f"return document.{table}.getBoundingClientRect().right - {cells}.at(-1)"
             assert chromium.execute_script(f"{rest}.getBoundingClientRect().right") < 3
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
-        assert right["y"] > left["y"] + left["height"] and left["width"] > 400
+        assert right["y"] > left["y"] + left["height"] and left["width"] > 350
     lost = no_estimate(9, 0.36, "lost", 4, 0.01)
     hint = ("Nothing was within reach: hold the hand nearer.",)
     view.show(replace(with_hand(moments()[0], estimate=lost, insight=None), advice=hint))
     eventually(lambda: text("state") == "LOST" and text("phase") == "lost: no hand found")
+    assert "LOST" in text("legend") and text("doubted") == "all doubtful"
     assert text("advice") == hint[0]
 
     def of_slots(name: str) -> list[str]:
@@ -224,8 +245,13 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     assert len(set(chromium.execute_script(colours))) == 8
     view.show(two_hands(moments()[1], lost=True))
     eventually(lambda: of_slots("state") == ["tracking", "LOST"])
-    view.show(moments()[1])
+    doubted = replace(moments()[1].estimates[0], joint_ok=np.arange(21) > 3)
+    view.show(replace(with_hand(moments()[1], estimate=doubted), dropped=7))
     eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
+    assert (text("doubted"), text("fingers")) == ("4 doubtful", "wrist, thumb")
+    assert "dashed" in text("legend") and text("dropped") == "7"
+    view.show(moments()[1])
+    eventually(lambda: text("doubted") == "all ok" and text("legend") == "")
     assert chromium.get_log("browser") == []
 
     view._end("over")

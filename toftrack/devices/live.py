@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from toftrack.devices.base import BaseDevice
+from toftrack.devices.seen import cameras_seen
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
@@ -56,8 +57,9 @@ def chosen_serial(
     listed = ", ".join(sorted(numbers))
     if not numbers:
         raise ToftrackError(
-            f"no {maker} camera was found: plug it in, into a USB 3 port; on Linux its udev rules "
-            f"must be installed; or replay a recording with device.bag=FILE{otherwise}"
+            f"no {maker} camera was found ({cameras_seen()}): plug it in, into a USB 3 port; on "
+            "Linux its udev rules must be installed; or replay a recording with device.bag=FILE"
+            + otherwise
         )
     if serial is None and len(numbers) > 1:
         raise ToftrackError(

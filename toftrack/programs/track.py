@@ -207,7 +207,8 @@ class Run:
         hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
         told = self._told()
         advice = self.watch.advice(told, recent=True)
-        tracked = TrackedFrame(frame, depth, device.camera, hands, told is not None, advice)
+        given, dropped = told is not None, device.dropped
+        tracked = TrackedFrame(frame, depth, device.camera, hands, given, advice, dropped)
         view.show(tracked)
         if device.live:
             took_s, reduced = tracker.time.took_s(), tracker.time.reduced

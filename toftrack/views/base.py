@@ -45,6 +45,8 @@ class TrackedFrame:
     """The first hand's side is told, and not detected."""
     advice: tuple[str, ...] = ()
     """What to try, where the frames before this one hardly showed a hand, or the other one."""
+    dropped: int = 0
+    """Frames of a live device that came too late, up to this one."""
 
     @property
     def estimates(self) -> tuple[Estimate, ...]:

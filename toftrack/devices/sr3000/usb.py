@@ -18,6 +18,7 @@ import usb.core
 import usb.util
 from usb.backend import IBackend
 
+from toftrack.devices.seen import cameras_seen
 from toftrack.devices.sr3000.transport import (
     DamagedFrameError,
     EndOfStreamError,
@@ -148,8 +149,9 @@ class UsbTransport:
             found = chosen
         if not found:
             raise ToftrackError(
-                f"no SR3000{wanted} was found on USB (looked for the ids {names}): plug it in "
-                f"and switch it on (lsusb must list it), {_OTHERWISE}"
+                f"no SR3000{wanted} was found on USB (looked for the ids {names}; "
+                f"{cameras_seen(self._backend)}): plug it in and switch it on (lsusb must list "
+                f"it), {_OTHERWISE}"
             )
         if len(found) > 1:
             numbers = ", ".join(_serial_number(device) or "unreadable" for device in found)

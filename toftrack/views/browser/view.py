@@ -3,8 +3,8 @@
 The tracker only leaves the newest moment here. Another thread draws it and makes a JPEG of it, once
 for all who watch and not at all when nobody does.
 
-The page opens a websocket to `/live`. The server sends it facts, as JSON, and after those whose
-`picture` is true a JPEG. The page sends JSON:
+The page opens a websocket to `/live`. The server sends it JSON: the phase, and where `picture` is
+true the facts of one frame, after which the JPEG of that frame comes. The page sends JSON:
 
 | message | what happens |
 | --- | --- |
@@ -28,14 +28,17 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
+import numpy as np
 
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.estimate import is_vacant, state_words
+from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import hand_content, strict
 from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of
 from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand, View
@@ -121,6 +124,9 @@ class BrowserView(View):
         """
         if self._drawing.done():
             self._drawing.result()
+        if (amplitude := tracked.frame.amplitude) is not None:
+            # Drawn later, when the device may have used its memory for the next frame.
+            tracked = replace(tracked, frame=replace(tracked.frame, amplitude=np.array(amplitude)))
         now_s, took_s = time.monotonic(), tracked.hands[0].estimate.compute_s
         self._times_s.append(now_s)
         self._newest = tracked, now_s - (took_s if math.isfinite(took_s) else 0.0)
@@ -170,9 +176,12 @@ class BrowserView(View):
             pass  # everything was done by then
 
     def facts(self, picture: bool = False) -> dict[str, Any]:
-        """What the page is told; a `picture` follows."""
-        age = {"age_ms": round(1e3 * (time.monotonic() - self._arrived_s), 1)} if self.jpeg else {}
-        return {"phase": self._phase, "picture": picture} | self._facts | age
+        """What the page is told: the phase, and of a `picture`, which follows, its frame."""
+        told = {"phase": self._phase, "picture": picture}
+        if not picture:
+            return told
+        age_ms = round(1e3 * (time.monotonic() - self._arrived_s), 1)
+        return told | self._facts | {"age_ms": age_ms}
 
     def wanted(self) -> None:
         """A visitor waits for a picture."""
@@ -260,6 +269,7 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
     of_frame = {
         "index": int(first.estimate.index),
         "ms": strict(1e3 * first.estimate.compute_s),
+        "dropped": tracked.dropped,
         "advice": list(tracked.advice),
     }
     if len(tracked.hands) == 1:
@@ -273,8 +283,9 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
 
 
 def _hand_facts(hand: TrackedHand) -> dict[str, Any]:
+    doubted = [JOINT_NAMES[joint] for joint in np.flatnonzero(~hand.estimate.joint_ok)]
     state = {"there": not is_vacant(hand.estimate), "state": state_words(hand.estimate)}
-    return state | hand_content(hand.estimate, _SHOWN)
+    return state | {"doubted": doubted} | hand_content(hand.estimate, _SHOWN)
 
 
 def _rate(times_s: Sequence[float]) -> float | None:
