@@ -9,12 +9,11 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from toftrack.evaluation.figures import kept_keys
+
 NOT_YET = "not measured yet"
-HISTORY_KEYS = (
-    "usable_pct", "usable_90", "partly_pct", "silent_pct", "longest_silent", "false_alarm_pct",
-    "never_right", "median_first_right", "mean_all_mm", "mean_mm", "usable_mean_mm",
-    "usable_tip_mm", "swap_pct", "jitter_mm", "in_region_90_pct", "gesture_pct", "median_ms",
-)  # fmt: skip
+HISTORY_KEYS = ("usable_pct", "usable_90", *kept_keys("each")[1:])
+"""Of recordings, what is kept; of the first one the interval, too."""
 _FACTS = ("date", "commit", "method", "hands", "seeds", "side", "machine", "versions")
 HISTORY_HEAD = (*_FACTS, *HISTORY_KEYS)
 """Columns of the table in docs/lab/history.md."""

@@ -28,6 +28,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from toftrack.evaluation.figures import kept_keys
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
 from figure_tables import HISTORY_KEYS, history_row, history_rows, with_tables  # noqa: E402
@@ -40,10 +42,6 @@ SETS = {"crowd": "told", "grasps": "told", "mesh-hand": "auto"}
 """What toftrack is developed on, and whether the side is told: mesh-hand does not know it."""
 BARE = 12
 """So many of the strangers, the first ones, show bare hands to a camera before them."""
-IMAGE_KEYS = (
-    "images", "tips_20_pct", "tips_40_pct", "wrong_pct", "flagged_pct", "tips_median_mm",
-    "tips_mean_mm", "found_pct", "named_pct", "wrong_name_pct",
-)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -98,7 +96,7 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
             labels = DATA / name / "labels.json"
             found = _benchmark([file, "--labels", labels], "told", options)
             images = next(iter(found["images"].values()))
-            kept = {key: images[key] for key in IMAGE_KEYS if images.get(key) is not None}
+            kept = {key: images[key] for key in kept_keys("images") if images.get(key) is not None}
             rows[name] = kept | _about(found)
     if options.sets is not None:
         for name, side in SETS.items():

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import results
+from toftrack.evaluation.figures import columns
 from toftrack.evaluation.peer import MAKE_ENVIRONMENT, PEER, peer_process
 from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
@@ -61,17 +62,6 @@ VARIANTS: dict[str, Variant] = {
     ),
     "side-found": Variant("handedness detected", (), "auto"),
     "two-hands": Variant("two hands", ("hands=2",)),
-}
-_SHOWN = {
-    "usable_pct": "usable %",
-    "partly_pct": "partly %",
-    "silent_pct": "silent %",
-    "false_alarm_pct": "false alarms %",
-    "mean_all_mm": "mean mm",
-    "usable_tip_mm": "usable tips mm",
-    "swap_pct": "swaps %",
-    "jitter_mm": "jitter mm",
-    "median_ms": "ms",
 }
 _GIVEN_ELSEWHERE = ("device", "camera", "seed", "hands", "view", "stream", "smooth", "hydra")
 
@@ -240,12 +230,12 @@ def _differences(done: Mapping[str, list[Row]]) -> dict[str, Any]:
 
 def ablation_table(done: Mapping[str, list[Row]]) -> results.Table:
     """The default's figures, and the differences of each variant to them with their intervals."""
-    table: results.Table = [["variant", *_SHOWN.values()]]
+    table: results.Table = [["variant", *(heading for heading, *_ in columns("ablation"))]]
     for name, of in _differences(done).items():
         if name == DEFAULT:
-            cells = [text_of(of["total"].get(key)) for key in _SHOWN]
+            cells = [text_of(of["total"].get(key)) for _, key, _ in columns("ablation")]
         else:
-            cells = [_change(of["differences"].get(key)) for key in _SHOWN]
+            cells = [_change(of["differences"].get(key)) for _, key, _ in columns("ablation")]
         table.append([VARIANTS[name].about, *cells])
     return table
 

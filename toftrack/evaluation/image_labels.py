@@ -44,17 +44,6 @@ from toftrack.evaluation.trust import OK_MM, TIPS, tips_inset
 from toftrack.files.json_text import read_json
 from toftrack.hand.skeleton import JOINT_NAMES
 
-IMAGE_MEANS = (
-    "tips_20_pct",
-    "tips_40_pct",
-    "wrong_pct",
-    "flagged_pct",
-    "wrong_no_flag_pct",
-    "found_pct",
-    "named_pct",
-    "wrong_name_pct",
-)
-"""Figures of a labelled image, 0 or 100."""
 UNNAMED = ("", "other")
 _INSET_M = 0.005
 _FLAGS = ("visible", "guessed", "absent")

@@ -23,79 +23,13 @@ import torch
 
 import toftrack
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.evaluation.image_labels import IMAGE_MEANS
-from toftrack.evaluation.rows import (
-    MEANS,
-    Row,
-    by_recording,
-    groups,
-    image_totals,
-    interval_name,
-    totals,
-)
+from toftrack.evaluation.figures import COMPARED, Columns, columns
+from toftrack.evaluation.rows import Row, by_recording, groups, image_totals, interval_name, totals
 from toftrack.evaluation.statistics import interval, text_of
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
 
 FORMAT = "toftrack accuracy 1"
-COMPARED = (*MEANS, "longest_silent", "never_right", "first_right", *IMAGE_MEANS)
-_COLUMNS = (
-    ("visible", "visible", 0),
-    ("usable %", "usable_pct", 1),
-    ("partly %", "partly_pct", 1),
-    ("silent %", "silent_pct", 1),
-    ("longest", "longest_silent", 0),
-    ("false alarms %", "false_alarm_pct", 1),
-    ("never right", "never_right", 1),
-    ("first right", "first_right", 0),
-    ("mean mm", "mean_all_mm", 1),
-    ("unflagged", "mean_mm", 1),
-    ("usable mm", "usable_mean_mm", 1),
-    ("tips mm", "usable_tip_mm", 1),
-    ("swaps %", "swap_pct", 1),
-    ("jitter mm", "jitter_mm", 2),
-    ("90 % regions", "in_region_90_pct", 1),
-    ("wrong tips", "tips_wrong", 0),
-    ("flagged %", "wrong_flagged_pct", 1),
-    ("right tips", "tips_right", 0),
-    ("right flagged %", "right_flagged_pct", 1),
-    ("gestures %", "gesture_pct", 1),
-    ("side at end %", "side_right_end_pct", 0),
-    ("after 10 %", "side_right_soon_pct", 0),
-    ("certain, wrong %", "side_wrong_certain_pct", 1),
-    ("2nd usable %", "second_usable_pct", 1),
-    ("2nd silent %", "second_silent_pct", 1),
-    ("ghosts %", "ghost_pct", 1),
-    ("ms", "median_ms", 1),
-    ("p90 ms", "p90_ms", 1),
-)
-"""Columns that no row has anything for are left out."""
-_GROUP_COLUMNS = (
-    ("frames", "frames", 0),
-    ("usable %", "usable_pct", 1),
-    ("partly %", "partly_pct", 1),
-    ("silent %", "silent_pct", 1),
-    ("false alarms %", "false_alarm_pct", 1),
-    ("unflagged mm", "mean_mm", 1),
-    ("gestures %", "gesture_pct", 1),
-)
-_IMAGE_COLUMNS = (
-    ("images", "images", 0),
-    ("tips < 20 mm %", "tips_20_pct", 1),
-    ("< 40 mm %", "tips_40_pct", 1),
-    ("wrong, unflagged %", "wrong_pct", 1),
-    ("lost %", "flagged_pct", 1),
-    ("wrong, no flag %", "wrong_no_flag_pct", 1),
-    ("wrong tips", "tips_wrong", 0),
-    ("flagged %", "wrong_flagged_pct", 1),
-    ("right tips", "tips_right", 0),
-    ("right flagged %", "right_flagged_pct", 1),
-    ("tips median mm", "tips_median_mm", 1),
-    ("tips mean mm", "tips_mean_mm", 1),
-    ("found %", "found_pct", 1),
-    ("named rightly %", "named_pct", 1),
-    ("wrong name %", "wrong_name_pct", 1),
-)
 Table = list[list[str]]
 """Rows of cells, the heads first; the first column is text."""
 
@@ -254,8 +188,8 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
     total = result.get("total")
     if total:
         all_of = {**total, "first_right": total["median_first_right"]}
-        table = table_of(_COLUMNS, {**result["each"], "total": all_of}, "recording")
-        shares = [(key, digits) for title, key, digits in _COLUMNS if title in table[0]]
+        table = table_of(columns("each"), {**result["each"], "total": all_of}, "recording")
+        shares = [(key, digits) for title, key, digits in columns("each") if title in table[0]]
         table.append(["90 % interval", *(_interval(total, *share) for share in shares)])
         tables["recordings"] = table
     shown: dict[str, Any] = {}
@@ -263,9 +197,9 @@ def accuracy_tables(result: Mapping[str, Any]) -> dict[str, Table]:
         shown[name] = figures
         shown |= {f"  {of}": row for of, row in figures.get("by", {}).items()}
     if shown:
-        tables["labelled images"] = table_of(_IMAGE_COLUMNS, shown, "labels")
+        tables["labelled images"] = table_of(columns("images"), shown, "labels")
     for kind, found in result.get("groups", {}).items():
-        tables[kind] = table_of(_GROUP_COLUMNS, found, kind)
+        tables[kind] = table_of(columns("groups"), found, kind)
     if comparison := result.get("comparison"):
         tables[f"differences to {comparison['with']}"] = difference_table(comparison["differences"])
     return tables
@@ -303,9 +237,7 @@ def markdown(table: Table) -> str:
     return "\n".join(f"| {' | '.join(row)} |" for row in [table[0], rule, *table[1:]])
 
 
-def table_of(
-    columns: Sequence[tuple[str, str, int]], rows: Mapping[str, Mapping[str, Any]], first: str
-) -> Table:
+def table_of(columns: Columns, rows: Mapping[str, Mapping[str, Any]], first: str) -> Table:
     """Rows by name; columns (title, key, digits) that no row has anything for are left out."""
     used = [
         column for column in columns if any(r.get(column[1]) is not None for r in rows.values())

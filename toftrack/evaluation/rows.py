@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.evaluation.image_labels import IMAGE_MEANS, tip_figures
+from toftrack.evaluation.figures import IMAGE_MEANS, MEANS, SHARES, keys_over
+from toftrack.evaluation.image_labels import tip_figures
 from toftrack.evaluation.measures import FLAG_COUNTS, Measured, MeasuredRecording
 from toftrack.evaluation.statistics import interval, mean_of, rounded
 from toftrack.frames.frame import Truth
@@ -29,28 +30,6 @@ from toftrack.frames.frame import Truth
 Row = dict[str, Any]
 """One recording with one seed: `recording`, `seed`, figures (None: about nothing), `groups`."""
 
-SHARES = ("usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
-MEANS = (
-    *SHARES,
-    "mean_mm",
-    "mean_all_mm",
-    "usable_mean_mm",
-    "usable_tip_mm",
-    "tip_mm",
-    "swap_pct",
-    "jitter_mm",
-    "in_region_90_pct",
-    "gesture_pct",
-    "side_right_end_pct",
-    "side_right_soon_pct",
-    "side_wrong_certain_pct",
-    "second_usable_pct",
-    "second_silent_pct",
-    "ghost_pct",
-    "median_ms",
-    "p90_ms",
-)
-"""Figures whose total is the mean over recordings, with an interval."""
 _POOLED = ("seed", *FLAG_COUNTS)
 NEVER = 999
 _DISTANCES_M = (0.3, 0.4, 0.5, 0.6, 0.7)
@@ -147,9 +126,9 @@ def by_recording(rows: Sequence[Row]) -> dict[str, Row]:
             if key not in _POOLED and (value is None or isinstance(value, int | float))
         )
         each[name] = {key: rounded(mean_of([row.get(key) for row in mine])) for key in keys}
-        runs = [row["longest_silent"] for row in mine if row.get("longest_silent") is not None]
-        if runs:
-            each[name]["longest_silent"] = max(runs)
+        for key in keys_over("largest"):
+            if values := [row[key] for row in mine if row.get(key) is not None]:
+                each[name][key] = max(values)
         each[name] |= flag_figures(mine)
     return each
 
@@ -160,12 +139,14 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
     total: dict[str, Any] = {
         "recordings": len(each),
         "seeds": len({row["seed"] for row in rows}),
-        "frames": round(sum(row.get("frames") or 0 for row in each)),
-        "visible": round(sum(row.get("visible") or 0 for row in each)),
     }
+    for key in keys_over("count"):
+        total[key] = round(sum(row.get(key) or 0 for row in each))
     total |= _means(each, MEANS) | flag_figures(rows)
-    total["longest_silent"] = max((row.get("longest_silent") or 0 for row in each), default=0)
-    total["never_right"] = rounded(sum(row.get("never_right") or 0.0 for row in each))
+    for key in keys_over("largest"):
+        total[key] = max((row.get(key) or 0 for row in each), default=0)
+    for key in keys_over("sum"):
+        total[key] = rounded(sum(row.get(key) or 0.0 for row in each))
     firsts = [row["first_right"] for row in rows if row.get("never_right") is not None]
     counted = [NEVER if first is None else first for first in firsts]
     total["median_first_right"] = float(np.median(counted)) if counted else None
