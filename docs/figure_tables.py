@@ -89,27 +89,35 @@ def _readme(rows: Rows) -> list[str]:
     return [
         "| | toftrack | MediaPipe Hands |",
         "| --- | --- | --- |",
-        "| **12 drawn persons** on whom nothing was tuned: frames in which every joint is within"
-        f" 40 mm, and which are not flagged as lost | {both(bare, 'usable_pct', '%')} |",
-        f"| ... frames that are wrong and not flagged | {both(bare, 'silent_pct', '%', 1)} |",
-        "| ... mean joint error, all frames in which the hand is visible |"
-        f" {both(bare, 'mean_all_mm', 'mm', 1)} |",
-        "| time for a frame of the packaged sample, both in turn; MediaPipe looks for one hand |"
-        f" {both('in turn', 'median_ms', 'ms', 1)} |",
-        "| **4 more, three of whom hold things**: frames in which every joint is within 40 mm |"
-        f" {both(others, 'usable_pct', '%')} |",
-        "| **a real Kinect V2 recording**, 27 labelled frames, *with which weights and thresholds"
-        " were chosen*: those with all visible fingertips within 40 mm |"
-        f" {one('kinect2', 'tips_40_pct', '%')} |",
-        "| ... 25 other frames of it, with which nothing was chosen: the same |"
-        f" {one('kinect2, kept back', 'tips_40_pct', '%')} |",
-        "| ... of these 25: a fingertip is farther off, and not flagged |"
+        "| **real, chosen with nothing: Senz3D on the head**, 1015 frames of three motions of one"
+        f" hand: every joint within 40 mm, and not flagged | {one('away', 'usable_pct', '%')} |",
+        f"| ... wrong as a whole, and not flagged | {one('away', 'silent_pct', '%', 1)} |",
+        "| ... of the frames that are not flagged: all visible fingertips within 40 mm |"
+        f" {one('away', 'tips_40_pct', '%')} |",
+        "| **real, chosen with nothing: Kinect V2**, 25 frames: all visible fingertips within 40 mm"
+        f" | {one('kinect2, kept back', 'tips_40_pct', '%')} |",
+        "| ... a fingertip is farther off, and not flagged |"
         f" {one('kinect2, kept back', 'wrong_pct', '%')} |",
-        "| **165 real single images** of eleven gestures (Senz3D): the hand is found |"
+        "| **real: a hand with a thing, SR300 on the head**, 84 frames, in all of which the pose is"
+        f" wrong: flagged | {one('at hand', 'thing_flagged_pct', '%')} |",
+        "| **real, chosen with them**: 27 other frames of the Kinect, all visible fingertips within"
+        f" 40 mm | {one('kinect2', 'tips_40_pct', '%')} |",
+        "| ... 165 single images of eleven gestures, Senz3D: the hand is found |"
         f" {one('stills', 'found_pct', '%')} |",
         f"| ... and its gesture is named rightly | {one('stills', 'named_pct', '%')} |",
+        "| ... 1151 frames of three other motions, Senz3D on the head: every joint within 40 mm,"
+        f" and not flagged | {one('at hand', 'usable_pct', '%')} |",
+        "| **12 drawn persons** on whom nothing was tuned: every joint within 40 mm, and not"
+        f" flagged | {both(bare, 'usable_pct', '%')} |",
+        f"| ... wrong as a whole, and not flagged | {both(bare, 'silent_pct', '%', 1)} |",
+        "| ... mean joint error, all frames in which the hand is visible |"
+        f" {both(bare, 'mean_all_mm', 'mm', 1)} |",
+        "| **4 more, three of whom hold things**: every joint within 40 mm, and not flagged |"
+        f" {both(others, 'usable_pct', '%')} |",
         "| **drawn rooms, and persons who raise no hand**: frames that are called a hand |"
         f" {one('empty', 'silent_pct', '%', 1)} |",
+        "| **time** of a frame of the packaged sample, in turn; MediaPipe looks for one hand |"
+        f" {both('in turn', 'median_ms', 'ms', 1)} |",
     ]
 
 

@@ -6,6 +6,7 @@
     python docs/make_figures.py --tables          write the tables only
     python docs/make_figures.py --strangers       track the public test set, append to history.md
     python docs/make_figures.py --in-turn FILE    take the times, measure nothing
+    python docs/make_figures.py --real NAME=FILE  take what measure.py measured of real recordings
 
 The first measures the sample, tests/data/guards and tests/data/empty; with the recordings that
 tests/data/kinect2/make_extract.py and tests/data/stills/make_extract.py make, the labelled images;
@@ -49,7 +50,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.strangers:
         _append_strangers(options)
     figures = json.loads(FIGURES.read_text(encoding="utf-8")) if FIGURES.exists() else {"rows": {}}
-    if options.in_turn is not None:
+    if options.real is not None:
+        figures["rows"] |= _real(*options.real.split("=", 1))
+    elif options.in_turn is not None:
         figures["rows"] |= _in_turn(options.in_turn)
     elif not options.tables and not options.strangers:
         figures["rows"] |= _measured(options)
@@ -75,6 +78,8 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--strangers", action="store_true", help="track the public test set")
     what.add_argument("--tables", action="store_true", help="measure nothing")
     what.add_argument("--in-turn", type=Path, metavar="FILE", help="of benchmark alternating")
+    about = "at hand or away, and the JSON of tests/data/real/measure.py"
+    what.add_argument("--real", metavar="NAME=FILE", help=about)
     parser.add_argument("--kinect2", type=Path, metavar="FILE", help="the real recording")
     parser.add_argument("--stills", type=Path, metavar="FILE", help="the real stills")
     parser.add_argument("--sets", type=Path, metavar="DATA", help="the sets to develop on")
@@ -102,6 +107,27 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
         for name, side in SETS.items():
             rows |= _rows(name, [options.sets / name], side, options, peer=True)
     return rows
+
+
+def _real(name: str, file: str) -> dict[str, Any]:
+    """The row of real recordings: means over those with truth, weighted by their frames; of the
+    others how many frames are flagged. FILE is what tests/data/real/measure.py --json wrote."""
+    from toftrack import __version__
+    from toftrack.evaluation.results import commit
+
+    found = json.loads(Path(file).read_text(encoding="utf-8"))
+    true = [row for row in found.values() if "usable_pct" in row]
+    row: dict[str, Any] = {"commit": commit(), "seeds": [0], "versions": f"toftrack {__version__}"}
+    row["frames"] = sum(one["frames"] for one in true)
+    for key in ("usable_pct", "silent_pct", "tips_40_pct", "tips_wrong_ok_pct"):
+        said = [one["frames"] - one["flagged"] * key.startswith("tips") for one in true]
+        row[key] = round(
+            sum(n * one[key] for n, one in zip(said, true, strict=True)) / sum(said), 2
+        )
+    for one in found.values():
+        if "usable_pct" not in one and "flagged" in one:
+            row["thing_flagged_pct"] = round(100 * one["flagged"] / one["frames"], 1)
+    return {name: row}
 
 
 def _in_turn(file: Path) -> dict[str, Any]:

@@ -122,7 +122,7 @@ def _visible(points_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.nda
 
 
 def _images(kept: dict[str, np.ndarray], settings: list[str]) -> dict[str, Any]:
-    called = []
+    called, settings = [], [*settings, "hand.side=auto"]  # nobody says whose hand each shows
     for number, image in enumerate(kept["depth_m"]):
         tracker = make_hands_tracker(*settings)
         for index in range(_SHOWN_FRAMES):
