@@ -100,8 +100,8 @@ def _readme(rows: Rows) -> list[str]:
         f" | {one('kinect2, kept back', 'tips_40_pct', '%')} |",
         "| ... a fingertip is farther off, and not flagged |"
         f" {one('kinect2, kept back', 'wrong_pct', '%')} |",
-        "| **real, on which settings were chosen**: 27 other frames of the Kinect, all visible fingertips within"
-        f" 40 mm | {one('kinect2', 'tips_40_pct', '%')} |",
+        "| **real, on which settings were chosen**: 27 other frames of the Kinect, all visible"
+        f" fingertips within 40 mm | {one('kinect2', 'tips_40_pct', '%')} |",
         "| ... 165 single images of eleven gestures, Senz3D: the hand is found |"
         f" {one('stills', 'found_pct', '%')} |",
         f"| ... and its gesture is named rightly | {one('stills', 'named_pct', '%')} |",

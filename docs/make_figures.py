@@ -112,12 +112,11 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
 def _real(name: str, file: str) -> dict[str, Any]:
     """The row of real recordings: means over those with truth, weighted by their frames; of the
     others how many frames are flagged. FILE is what tests/data/real/measure.py --json wrote."""
-    from toftrack import __version__
-    from toftrack.evaluation.results import commit
+    from toftrack.evaluation.results import circumstances
 
     found = json.loads(Path(file).read_text(encoding="utf-8"))
     true = [row for row in found.values() if "usable_pct" in row]
-    row: dict[str, Any] = {"commit": commit(), "seeds": [0], "versions": f"toftrack {__version__}"}
+    row = _about(circumstances() | {"seeds": [0], "side": "told"})
     row["frames"] = sum(one["frames"] for one in true)
     for key in ("usable_pct", "silent_pct", "tips_40_pct", "tips_wrong_ok_pct"):
         said = [one["frames"] - one["flagged"] * key.startswith("tips") for one in true]
