@@ -89,15 +89,15 @@ def _readme(rows: Rows) -> list[str]:
     return [
         "| | toftrack | MediaPipe Hands |",
         "| --- | --- | --- |",
-        "| **real, nothing chosen on it: Senz3D on the head**, 1015 frames of three motions of one"
-        f" hand: every joint within 40 mm, and not flagged | {one('away', 'usable_pct', '%')} |",
+        "| **real, nothing chosen on it: Senz3D on the head**, 1015 frames of three motions of"
+        f" one hand: every joint within 40 mm, and not flagged | {one('away', 'usable_pct', '%')} |",
         f"| ... wrong as a whole, and not flagged | {one('away', 'silent_pct', '%', 1)} |",
         "| ... of the frames that are not flagged: all visible fingertips within 40 mm |"
         f" {one('away', 'tips_40_pct', '%')} |",
         "| ... a visible fingertip is farther off, and neither it nor the frame is flagged |"
         f" {one('away', 'tips_wrong_ok_pct', '%', 1)} |",
-        "| **real, nothing chosen on it: Kinect V2**, 25 frames: all visible fingertips within 40 mm"
-        f" | {one('kinect2, kept back', 'tips_40_pct', '%')} |",
+        "| **real, nothing chosen on it: Kinect V2**, 25 frames: all visible fingertips within"
+        f" 40 mm | {one('kinect2, kept back', 'tips_40_pct', '%')} |",
         "| ... a fingertip is farther off, and not flagged |"
         f" {one('kinect2, kept back', 'wrong_pct', '%')} |",
         "| **real, on which settings were chosen**: 27 other frames of the Kinect, all visible"
