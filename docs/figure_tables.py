@@ -90,7 +90,8 @@ def _readme(rows: Rows) -> list[str]:
         "| | toftrack | MediaPipe Hands |",
         "| --- | --- | --- |",
         "| **real, nothing chosen on it: Senz3D on the head**, 1015 frames of three motions of"
-        f" one hand: every joint within 40 mm, and not flagged | {one('away', 'usable_pct', '%')} |",
+        " one hand: every joint within 40 mm, and not flagged |"
+        f" {one('away', 'usable_pct', '%')} |",
         f"| ... wrong as a whole, and not flagged | {one('away', 'silent_pct', '%', 1)} |",
         "| ... of the frames that are not flagged: all visible fingertips within 40 mm |"
         f" {one('away', 'tips_40_pct', '%')} |",
