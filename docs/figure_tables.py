@@ -89,7 +89,7 @@ def _readme(rows: Rows) -> list[str]:
     return [
         "| | toftrack | MediaPipe Hands |",
         "| --- | --- | --- |",
-        "| **real, nothing chosen on it: Senz3D on the head**, 1015 frames of three motions of"
+        "| **real, put away until the end: Senz3D on the head**, 1015 frames of three motions of"
         " one hand: every joint within 40 mm, and not flagged |"
         f" {one('away', 'usable_pct', '%')} |",
         f"| ... wrong as a whole, and not flagged | {one('away', 'silent_pct', '%', 1)} |",

@@ -92,10 +92,8 @@ def test_pictures_follow_one_another_and_none_comes_twice(view, visitor) -> None
     with pytest.raises(TimeoutError):
         visitor.socket.recv(0.2)
     with Visitor(view.url) as other:  # who comes later sees the newest one at once
-        assert other.first == {
-            "phase": "live",
-            "picture": False,
-        }  # of a frame with its picture only
+        # What is said of a frame comes with its picture only.
+        assert other.first == {"phase": "live", "picture": False}
         assert other.picture()[1] == bodies[-1]
 
 

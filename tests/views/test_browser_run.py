@@ -161,9 +161,8 @@ def test_the_page_shows_image_skeleton_and_number_of_one_frame(chromium, view) -
         eventually(lambda: chromium.execute_script(script)[1] != "–")
         for _ in range(12):
             url, index = chromium.execute_script(script)
-            assert numbers_of(base64.b64decode(url.partition(",")[2])) == 2 * (
-                (int(index) - 1) % 8,
-            )
+            shown = numbers_of(base64.b64decode(url.partition(",")[2]))
+            assert shown == 2 * ((int(index) - 1) % 8,)
             seen.add(index)
     assert len(seen) > 1
 

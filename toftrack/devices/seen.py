@@ -30,7 +30,7 @@ def cameras_seen(backend: Any = None) -> str:
         found = usb.core.find(find_all=True, backend=backend)
         ids = [f"{one.idVendor:04x}:{one.idProduct:04x}" for one in found]
         seen = [name for id in ids for name, known in _KNOWN.items() if re.match(known, id)]
-    except (usb.core.NoBackendError, usb.core.USBError, NotImplementedError) as error:
+    except (usb.core.NoBackendError, usb.core.USBError) as error:
         unlisted = f"; USB cannot be listed, which needs libusb-1.0 and permission: {error}"
         seen = list(_by_sdks())
     return (f"seen: {', '.join(seen)}" if seen else "no depth camera is seen") + unlisted
