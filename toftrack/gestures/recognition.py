@@ -104,11 +104,12 @@ class Gestures:
         """Whether all is known that makes a hand's pose this class: of its definition that suits
         the values (13,) best every feature. Of "other" nothing needs to be known.
         """
+        unknown = np.isnan(values)
         mine = self.classes == self.names.index(label)
-        if label == OTHER or not mine.any():
+        if label == OTHER or not unknown.any() or not mine.any():
             return True
         best = self.low[mine][self._log_densities(values)[mine].argmax()]
-        return not (np.isnan(values) & ~np.isnan(best)).any()
+        return not (unknown & ~np.isnan(best)).any()
 
     def _log_densities(self, values: np.ndarray) -> np.ndarray:
         """(M,) of the values (13,), in parts of the uniform density of "other"."""

@@ -10,13 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.render.segmentation import Observation
 
 REACH_M = 0.16
 """Points farther than this from the middle of a hand are none of it."""
 _MARGIN_PX = 24
 """Around the silhouette; beyond it, what sticks out is drawn to where it was nearest to."""
-_EDGE_M, _FAR_M = 0.03, 10.0
+_EDGE_M, _FAR_M = np.float32(0.03), np.float32(10.0)
 """Depths of neighbours that differ by so much are an edge; and the depth where nothing is read."""
 
 
@@ -81,16 +82,31 @@ def smooth_points(
 
     depth_m, hand: (h, w) of a crop whose first pixel is at `corner`, row and column.  k: (3, 3).
     """
-    if not hand.any():
-        return np.zeros((0, 3), np.float32)
-    far = np.where(depth_m > 0, depth_m, np.float32(_FAR_M))
-    square = np.ones((3, 3), np.uint8)
-    smooth = (cv2.dilate(far, square) - cv2.erode(far, square)) < _EDGE_M
-    u, v = _pixels(hand & smooth)
-    z = depth_m[v, u]
-    x = (u + corner[1] - k[0, 2]) / k[0, 0] * z
-    y = (v + corner[0] - k[1, 2]) / k[1, 1] * z
-    return np.stack((x, y, z), 1).astype(np.float32)
+    points = np.empty((hand.size, 3), np.float32)
+    return points[: _add_points(depth_m, hand, corner, k, points)]
+
+
+@entry_point
+def _add_points(depth_m, hand, corner, k, points):
+    """See smooth_points; how many of `points` (h w, 3) are written."""
+    height, width = hand.shape
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            if not hand[v, u]:
+                continue
+            nearest = farthest = depth_m[v, u] if depth_m[v, u] > 0 else _FAR_M
+            for row in range(max(v - 1, 0), min(v + 2, height)):
+                for column in range(max(u - 1, 0), min(u + 2, width)):
+                    z = depth_m[row, column] if depth_m[row, column] > 0 else _FAR_M
+                    nearest, farthest = min(nearest, z), max(farthest, z)
+            if farthest - nearest < _EDGE_M:
+                z = np.float64(depth_m[v, u])
+                points[count, 0] = (u + corner[1] - np.float64(k[0, 2])) / k[0, 0] * z
+                points[count, 1] = (v + corner[0] - np.float64(k[1, 2])) / k[1, 1] * z
+                points[count, 2] = depth_m[v, u]
+                count += 1
+    return count
 
 
 def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, int]) -> np.ndarray:
@@ -98,13 +114,21 @@ def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, 
 
     labels: (h, w) numbers of these pixels, of OpenCV's distance transform.  solid: (h, w) bool.
     """
-    u, v = _pixels(solid)
-    lookup = np.zeros((len(u) + 1, 2), np.float32)
-    lookup[labels[v, u]] = np.stack((u + corner[1], v + corner[0]), 1)
-    return lookup.take(np.asarray(labels), 0)
+    nearest = np.empty((*solid.shape, 2), np.float32)
+    _look_up(labels, solid, corner, np.zeros((solid.size + 1, 2), np.float32), nearest)
+    return nearest
 
 
-def _pixels(mask: np.ndarray) -> np.ndarray:
-    """Columns and rows of the pixels of a mask, (2, n) int32, row by row."""
-    found = cv2.findNonZero(mask.view(np.uint8))
-    return np.zeros((2, 0), np.int32) if found is None else found.reshape(-1, 2).T
+@entry_point
+def _look_up(labels, solid, corner, places, nearest):
+    """See nearest_of_labels; places: (h w + 1, 2) of the labels, and `nearest` are written."""
+    height, width = solid.shape
+    for v in range(height):
+        for u in range(width):
+            if solid[v, u]:
+                places[labels[v, u], 0] = u + corner[1]
+                places[labels[v, u], 1] = v + corner[0]
+    for v in range(height):
+        for u in range(width):
+            nearest[v, u, 0] = places[labels[v, u], 0]
+            nearest[v, u, 1] = places[labels[v, u], 1]

@@ -90,6 +90,8 @@ def least_cost(cost: np.ndarray) -> list[int]:
     of exchanges, by costs that are reduced by what rows and columns are worth.
     """
     rows, columns = cost.shape
+    if rows == 1:
+        return [int(cost[0].argmin())]
     row_worth, column_worth = np.zeros(rows), np.zeros(columns + 1)
     row_of = np.full(columns + 1, -1)  # the last column stands for that of the row to be placed
     for row in range(rows):
