@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
-from toftrack.compute.rigid import PIVOT_M, Motions, redraw_with
+from toftrack.compute.rigid import PIVOT_M, Motions
 
 _PIVOT = np.array(PIVOT_M)
 
@@ -84,22 +84,55 @@ def turned(q, x, y, z):
     )
 
 
+@compiled
+def _moved(r, t, pivot, out):
+    """One row of compose_rows."""
+    before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
+    turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
+    after = product(turn, before)
+    old = turned(before, pivot[0], pivot[1], pivot[2])
+    new = turned(after, pivot[0], pivot[1], pivot[2])
+    vector = rotation_vector(after)
+    for j in range(3):
+        out[j] = r[j] + old[j] + t[j] - new[j]
+        out[3 + j] = vector[j]
+    for j in range(6, len(out)):
+        out[j] = r[j] + t[j]
+
+
 @entry_point
 def compose_rows(reference, tangent, pivot, out):
-    """See rigid.compose; reference, tangent, out: (N, 6 + d) float32.  pivot: (3,) float64."""
+    """See rigid.compose; reference, tangent, out: (N or 1, 6 + d) float32.  pivot: (3,) float64."""
+    left, right = min(len(reference) - 1, 1), min(len(tangent) - 1, 1)
     for i in range(len(out)):
-        r, t = reference[i], tangent[i]
-        before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))
-        turn = quaternion(np.float64(t[3]), np.float64(t[4]), np.float64(t[5]))
-        after = product(turn, before)
-        old = turned(before, pivot[0], pivot[1], pivot[2])
-        new = turned(after, pivot[0], pivot[1], pivot[2])
-        vector = rotation_vector(after)
-        for j in range(3):
-            out[i, j] = r[j] + old[j] + t[j] - new[j]
-            out[i, 3 + j] = vector[j]
-        for j in range(6, out.shape[1]):
-            out[i, j] = r[j] + t[j]
+        _moved(reference[left * i], tangent[right * i], pivot, out[i])
+
+
+@entry_point
+def redraw_rows(particles, weights, positions, tangents, lower, upper, folds, pivot, out):
+    """See rigid.redraw_with; particles, tangents, out: (n, 6 + d), bounds: (d,), float32.
+
+    weights: (M,), positions: (n,), pivot: (3,) float64.  folds: outside of the bounds, coordinates
+    are folded back instead of truncated.
+    """
+    total, most = 0.0, 0
+    for row in range(len(weights)):
+        total += weights[row]
+        most = row if weights[row] > 0 else most  # beyond it, only a rounding lies
+    taken, reached = 0, weights[0]
+    for i in range(len(out)):
+        while taken < most and reached <= positions[i] * total:
+            taken += 1
+            reached += weights[taken]
+        _moved(particles[taken], tangents[i], pivot, out[i])
+        for j in range(len(lower)):
+            least, latent = lower[j], out[i, 6 + j]
+            if folds:
+                there_and_back = np.float32(2) * (upper[j] - least)
+                folded = (latent - least) % there_and_back
+                out[i, 6 + j] = least + min(folded, there_and_back - folded)
+            else:
+                out[i, 6 + j] = min(max(latent, least), upper[j])
 
 
 @entry_point
@@ -190,9 +223,26 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
-    left, right = np.broadcast_arrays(_rows(reference), _rows(tangent))
-    out = np.empty(left.shape, np.float32)
-    compose_rows(np.ascontiguousarray(left), np.ascontiguousarray(right), _PIVOT, out)
+    left, right = _rows(reference), _rows(tangent)
+    out = np.empty((max(len(left), len(right)), left.shape[1]), np.float32)
+    compose_rows(left, right, _PIVOT, out)
+    return torch.from_numpy(out)
+
+
+def redraw(
+    particles: Tensor,
+    weights: Tensor,
+    positions: Tensor,
+    tangents: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    mode: str,
+) -> Tensor:
+    """See rigid.redraw_with; on the CPU, in float32."""
+    moves, shares = _rows(tangents), weights.double().numpy()
+    out, ends = np.empty(moves.shape, np.float32), (_rows(lower), _rows(upper))
+    given = _rows(particles), shares, positions.numpy(), moves, *ends, mode == "reflect"
+    redraw_rows(*given, _PIVOT, out)
     return torch.from_numpy(out)
 
 
@@ -227,4 +277,4 @@ def _rows(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.numpy(), np.float32)
 
 
-MOTIONS = Motions(compose, difference, redraw_with(compose), mean)
+MOTIONS = Motions(compose, difference, redraw, mean)
