@@ -12,7 +12,6 @@ Throughout, `hand` is a posed hand: its frames (16, 3, 3), joints (21, 3) and th
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
@@ -20,9 +19,8 @@ import torch
 from numpy import empty, zeros
 from torch import Tensor
 
-from toftrack.compute.compiling import compiled, entry_point, take
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
-from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
 from toftrack.hand.surface import hand_surface
@@ -389,8 +387,8 @@ def _scratch(ellipsoids, points, seen):
 
 
 @entry_point
-def refine_hands(states, priors, keypoints, seen, shape, surface, settings, counter):
-    """Refine hands as long as `counter` has any; called from several threads.
+def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
+    """Refine hands, one after the other: a few are done before a second thread is awake.
 
     states: (N, 27) float64, overwritten.  priors: (N, 21).
     keypoints: (N, 21, 3) and (N, 21), or one for all; inf = none.
@@ -399,7 +397,6 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings, coun
     shape: base_frames, base, lengths, mirror, see pose_hand.
     surface: index (E,), centres (E, 3), axes (E, 3, 3).
     settings: iterations, points, reach_m, point_m, silhouette_px, angle_rad, damping.
-    counter: (1,) int64 hands taken.
     """
     base_frames, base, lengths, mirror = shape
     index, centres, semi_axes = surface
@@ -409,10 +406,7 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings, coun
     )
     frames, joints, axes = hand
     xyz, distance, nearest = matched
-    while True:
-        i = take(counter)
-        if i >= len(states):
-            break
+    for i in range(len(states)):
         state, row = states[i], i % max(1, len(keypoints[0]))
         known, sigma = keypoints[0][row], keypoints[1][row]
         pose_hand(state, base_frames, base, lengths, mirror, frames, joints)
@@ -487,8 +481,7 @@ class Refiner:
             sigma = np.broadcast_to(_array(keypoints.sigma_m), (len(points), 21))
             known = points, sigma.copy()  # which may be written to, as the kernel was compiled for
         refined = _array(states)
-        task = functools.partial(
-            refine_hands,
+        refine_hands(
             refined,
             _array(prior_angles),
             known,
@@ -502,9 +495,7 @@ class Refiner:
             self._shape,
             self._surface,
             counts + numbers,
-            np.zeros(1, np.int64),
         )
-        run_shared(task, len(states))
         return torch.from_numpy(refined.astype(np.float32))
 
 

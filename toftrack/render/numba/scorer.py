@@ -18,6 +18,9 @@ from toftrack.render.numba.hand import LANES
 from toftrack.render.numba.kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
 
+_WORTH_A_THREAD = 8 * LANES
+"""Hypotheses for which it pays to wake a second thread; 150 are scored in less than that takes."""
+
 
 class NumbaScorer:
     """Kinematics, drawing and counting in compiled code, one particle after the other.
@@ -95,8 +98,7 @@ def score_rows(scorers: Sequence[Any], states: Tensor, evidences: Sequence[Evide
         for task in tasks:
             task()
 
-    # A second thread is not worth waking for less than a task of its own.
-    run_shared(all_of_them, x.shape[0] * x.shape[1] // LANES)
+    run_shared(all_of_them, x.shape[0] * x.shape[1] // _WORTH_A_THREAD)
     found = torch.from_numpy(counts).to(states.device)
     return Counts(*found.unbind(1))
 
