@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from torch import Tensor
@@ -20,7 +20,7 @@ from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.filter import PredictedHand, palm_of
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.posterior import touching
-from toftrack.tracking.state import Track, TrackerState
+from toftrack.tracking.state import Track, TrackerState, changed
 
 _STEP_M, _SPEED_M_S = 0.04, 0.25
 """Standard deviation of a predicted palm, and its growth from the last believed frame on."""
@@ -176,7 +176,7 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
         if track.number in ended and not track.confirmed
     ]
     kept = [track for track in tracks if track.number not in ended]
-    return replace(
+    return changed(
         state,
         tracks=tuple(sorted(kept, key=lambda track: track.number)),
         refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),

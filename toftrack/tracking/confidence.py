@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError, check_number
@@ -133,9 +134,10 @@ def _surprise(probability: float) -> float:
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
-    at, z = joints.numpy(), np.maximum(joints[:, 2].numpy(), _NEAREST_M)
-    seen = _readings(at[:, 0] / z, at[:, 1] / z, depth_m.numpy(), k.numpy())
-    behind = (seen > 0) & (seen < z - _BEHIND_M)
+    seen = np.empty((len(joints), 1))
+    read_around(joints.numpy(), depth_m.numpy(), k.numpy(), 0.0, seen)
+    z = np.maximum(joints[:, 2].numpy(), _NEAREST_M)
+    behind = (seen[:, 0] > 0) & (seen[:, 0] < z - _BEHIND_M)
     return float(np.isnan(seen).mean()), float(behind.mean())
 
 
@@ -143,10 +145,8 @@ def _seen_around(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np
     """(N, 3) of joints (N, 3): shares of 3 x 3 readings about each that are outside and without
     reading, and their median depth or NaN.
     """
-    z = np.maximum(joints_m[:, 2:], _NEAREST_M)
-    down, right = (side.ravel() * _AROUND_M for side in np.mgrid[-1:2, -1:2])
-    x, y = (joints_m[:, :1] + right) / z, (joints_m[:, 1:2] + down) / z
-    seen = _readings(x, y, depth_m, k)
+    seen = np.empty((len(joints_m), 9))
+    read_around(joints_m, depth_m, k, _AROUND_M, seen)
     outside, unread = np.isnan(seen), seen == 0
     count = (seen > 0).sum(1)
     ordered = np.sort(np.where(seen > 0, seen, np.inf), 1)  # the lower middle is the median
@@ -154,14 +154,24 @@ def _seen_around(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np
     return np.stack((outside.mean(1), unread.mean(1), np.where(count > 0, median, np.nan)), 1)
 
 
-def _readings(x: np.ndarray, y: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """Depths, shaped as x and y, at points of the plane z = 1: NaN outside, 0 without reading."""
-    height, width = depth_m.shape
-    column, row = np.rint(k[0, 0] * x + k[0, 2]), np.rint(k[1, 1] * y + k[1, 2])
-    inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    rows, columns = (np.where(inside, one, 0).astype(np.intp) for one in (row, column))
-    seen = depth_m[rows, columns].astype(np.float64)
-    return np.where(inside, np.where(seen > 0, seen, 0.0), np.nan)
+@entry_point
+def read_around(joints, depth, k, apart, seen):
+    """Depths about joints (N, 3), into (N, 1) or (N, 9): NaN outside, 0 without reading.
+
+    They are those of a square of points `apart` metres from each other, row by row.
+    """
+    height, width = depth.shape
+    side = 3 if seen.shape[1] == 9 else 1
+    for n in range(len(joints)):
+        z = max(joints[n, 2], _NEAREST_M)
+        for row in range(side):
+            for column in range(side):
+                x = (joints[n, 0] + apart * (column - side // 2)) / z
+                y = (joints[n, 1] + apart * (row - side // 2)) / z
+                u, v = round(k[0, 0] * x + k[0, 2]), round(k[1, 1] * y + k[1, 2])
+                inside = 0 <= u < width and 0 <= v < height
+                read = np.float64(depth[int(v), int(u)]) if inside else np.nan
+                seen[n, side * row + column] = 0.0 if read <= 0 else read
 
 
 JOINT_FEATURES = (

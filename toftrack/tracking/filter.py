@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from toftrack.compute.transfer import on_device
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.posterior import ImageTerm
-from toftrack.tracking.state import ParticleSet, Track, generator_on
+from toftrack.tracking.state import ParticleSet, Track, changed, generator_on
 
 _MOVEMENT_S = 0.3
 """How long a movement goes on (to 1/e)."""
@@ -140,7 +140,7 @@ def predict_particles(track: Track, dt_s: float, model: FilterModel) -> Particle
     """A track's particles dt_s later, moved as predicted; weights and spread stay."""
     cloud, moved = track.cloud, predicted_motion(track, dt_s, model.filter)
     mean = model.backend.motions.compose(cloud.mean, moved[None])
-    return replace(cloud, particles=_moved(cloud.particles, moved, model), mean=mean)
+    return changed(cloud, particles=_moved(cloud.particles, moved, model), mean=mean)
 
 
 def shift_particles(filtered: ParticleSet, pose: Tensor, model: FilterModel) -> ParticleSet:
@@ -150,7 +150,7 @@ def shift_particles(filtered: ParticleSet, pose: Tensor, model: FilterModel) -> 
     change = motions.difference(mean, filtered.mean)
     particles = motions.compose(filtered.particles, on_device(change, model.device))
     particles[:, 6:] = bound(particles[:, 6:], space.lower, space.upper, "truncate")
-    return replace(filtered, particles=particles, mean=mean)
+    return changed(filtered, particles=particles, mean=mean)
 
 
 def update_velocity(track: Track, mean: Tensor, dt_s: float, model: FilterModel) -> Tensor:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -30,7 +30,7 @@ from toftrack.tracking.confidence import Status
 from toftrack.tracking.filter import predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
-from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState, changed
 from toftrack.tracking.step import StepResult
 
 _WIDEST_PALM_M, _HALF_PALM_M = 0.06, 0.012
@@ -164,7 +164,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
             estimate = estimate.updated(side=slot.side, side_probability=sure)
             none = torch.zeros(0, 6 + model.space.dims, device=model.device)
             info = StepInfo(observation, none, none[:, 0], spans.seconds())
-            return replace(state, slots=(slot,)), (info,), (estimate,)
+            return changed(state, slots=(slot,)), (info,), (estimate,)
         likelihood = image_term(observation, fitted, model)
     with spans("start"):
         track = track or model.start(observation, model, generator)
@@ -176,7 +176,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     estimate = make_estimate(image, filtered, pose, score, status, fitted, model)
     sigma_m = _joint_sigma(estimate.joints_m, filtered, model.encode(pose), fitted, model)
     hidden = bool(observation.occluder.any())
-    track = replace(
+    track = changed(
         track,
         cloud=filtered,
         velocity=update_velocity(track, filtered.mean, dt_s, model),
@@ -192,8 +192,8 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     )
     slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
-    slot = replace(slot, track=track.number)
-    state = replace(state, generator=generator.get_state(), slots=(slot,), tracks=(track,))
+    slot = changed(slot, track=track.number)
+    state = changed(state, generator=generator.get_state(), slots=(slot,), tracks=(track,))
     return state, (info,), (estimate,)
 
 

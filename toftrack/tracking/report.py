@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -29,7 +29,15 @@ from toftrack.tracking.confidence import Status, joint_features, probability
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Slot, StepInfo, Track, TrackerState
+from toftrack.tracking.state import (
+    OTHER_SIDE,
+    ParticleSet,
+    Slot,
+    StepInfo,
+    Track,
+    TrackerState,
+    changed,
+)
 
 _OTHER = 0.4
 """A hand that is less probably of the side that the user said is flagged as another one."""
@@ -74,7 +82,7 @@ def report(
         slots.append(slot)
         infos.append(info)
         estimates.append(estimate)
-    return replace(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
+    return changed(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
 
 
 def assign_slots(
@@ -126,7 +134,7 @@ def report_track(
     """
     slot, track, view, model = state.slots[number], one.track, one.view, scene.model
     if slot.track != track.number:
-        slot = replace(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
+        slot = changed(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
     image = scene.image  # as the camera took it, and not reduced
     estimate = make_estimate(
         image, one.filtered, track.pose, one.score, one.status, view.fitted, model
@@ -141,7 +149,7 @@ def report_track(
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
     slot, estimate = finish_estimate(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
-    slot = replace(
+    slot = changed(
         slot,
         track=track.number,
         side=track.side,
@@ -189,10 +197,10 @@ def report_absence(
     """A slot without track, and a lost estimate: NaN, or of the only slot its last one."""
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
-        return replace(slot, track=-1, gesture=None), nothing
+        return changed(slot, track=-1, gesture=None), nothing
     estimate = lost_estimate(slot.last, image.index, image.timestamp_s, math.nan)
     gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
-    return replace(slot, track=-1, gesture=gesture), estimate
+    return changed(slot, track=-1, gesture=gesture), estimate
 
 
 def make_estimate(
@@ -254,7 +262,7 @@ def finish_estimate(
     estimate = in_all_conventions(estimate, shape, image.k, size_px)
     # While there is no hand, the last estimate that was believed is reported, if one was.
     kept = slot.last if estimate.lost and not slot.last.lost else estimate
-    return replace(slot, gesture=gesture, last=kept), estimate
+    return changed(slot, gesture=gesture, last=kept), estimate
 
 
 def _host(tensor: Tensor) -> np.ndarray:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -23,6 +24,16 @@ from toftrack.tracking.confidence import JOINT_FEATURES, NO_FEATURES, Confidence
 OTHER_SIDE = {"right": "left", "left": "right"}
 
 
+Record = TypeVar("Record")
+
+
+def changed(record: Record, **values: Any) -> Record:
+    """dataclasses.replace, in a fifth of its time, of a class without checks or derived values."""
+    made = object.__new__(type(record))
+    vars(made).update(vars(record) | values)
+    return made
+
+
 @dataclass(frozen=True)
 class SideEvidence:
     """Evidence for a hand's side, from comparisons; see sides.py.
@@ -39,7 +50,7 @@ class SideEvidence:
 
     def later(self, dt_s: float) -> SideEvidence:
         """The same evidence after dt_s without a comparison."""
-        return replace(self, age_s=self.age_s + dt_s)
+        return changed(self, age_s=self.age_s + dt_s)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,9 +177,9 @@ class TrackerState:
         before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
         passed = max(0.0, image.timestamp_s - before)
         refused = self.refused + np.array([0.0, 0.0, 0.0, passed])
-        return replace(
+        return changed(
             self,
-            slots=tuple(replace(slot, away_s=slot.away_s + passed) for slot in self.slots),
+            slots=tuple(changed(slot, away_s=slot.away_s + passed) for slot in self.slots),
             found_s=self.found_s + passed,
             refused=refused[refused[:, 3] < REFUSED_S],
             next_index=image.index + 1,

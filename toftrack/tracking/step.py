@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from itertools import compress
 
 import torch
@@ -28,7 +27,7 @@ from toftrack.tracking.filter import (
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState, changed
 from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
@@ -80,7 +79,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     ]
     with spans("detector"):
         places = pending.for_next_frame()
-    state = replace(
+    state = changed(
         state,
         places=places,
         found_s=0.0 if pending.asked else state.found_s,
@@ -95,7 +94,7 @@ def rest_track(scene: Scene, row: int) -> Track:
     """The track of a row after a frame in which it is only moved on."""
     hand, dt_s = scene.hands[row], scene.dt_s
     track = hand.track
-    return replace(
+    return changed(
         track,
         cloud=predict_particles(track, dt_s, scene.model),
         pose=hand.pose,
@@ -140,10 +139,10 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         pose, moved = select(propose(view, model.decode(filtered.mean)), view.hidden)
     if moved:
         fresh = new_track(pose, model)
-        track = replace(track, age=fresh.age, doubtful=fresh.doubtful, trend=fresh.trend)
+        track = changed(track, age=fresh.age, doubtful=fresh.doubtful, trend=fresh.trend)
     elif refines:
         pose, trend = steadied(pose, track.pose, track.trend, dt_s, motions)
-        track = replace(track, trend=trend)
+        track = changed(track, trend=trend)
     score, joints_m = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
     features = confidence_features(
         joints_m, score, track.age.seconds, view.detection, track.features, view.observation
@@ -152,7 +151,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     # Without refinement the particles stay where they are.
     drawn = shift_particles(filtered, pose, model) if refines else filtered
     believed = not status.lost
-    track = replace(
+    track = changed(
         track,
         cloud=drawn,
         velocity=update_velocity(track, drawn.mean, dt_s, model),

@@ -20,7 +20,7 @@ from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
-from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState, changed
 
 _SPARE = 1
 """So many tracks may exist beyond the slots, or beyond the two hands of a person."""
@@ -37,7 +37,7 @@ def predicted_view(scene: Scene, row: int) -> View | None:
 def _later(scene: Scene, row: int) -> Track:
     """The track of a row, with the time since its sides were compared as of this frame."""
     track = scene.hands[row].track
-    return replace(track, evidence=track.evidence.later(scene.dt_s))
+    return changed(track, evidence=track.evidence.later(scene.dt_s))
 
 
 def continue_track(
@@ -123,11 +123,11 @@ def make_view(
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view with its sides compared; restarted as the other side where that one is likelier."""
     evidence = compare_sides(view, mirrored, scene.image_for(row), told)
-    track, tracks = replace(view.track, evidence=evidence), [hand.track for hand in scene.hands]
+    track, tracks = changed(view.track, evidence=evidence), [hand.track for hand in scene.hands]
     if not changes_side(track, side_log_odds(track, tracks, told), told):
         return replace(view, track=track)
-    track = replace(track, side=OTHER_SIDE[track.side], shape=first_shape())
-    track = update_shape(replace(track, age=Duration()), mirrored, scene.model)
+    track = changed(track, side=OTHER_SIDE[track.side], shape=first_shape())
+    track = update_shape(changed(track, age=Duration()), mirrored, scene.model)
     other = make_view(scene, row, track, mirrored, expected_of(mirrored))
     if other is None:
         return view
@@ -141,7 +141,7 @@ def restart_track(view: View) -> Track:
     image = image_term(seen, view.fitted, model, coverage=1.0)
     pose, _ = best_start(replace(view, observation=seen, image=image))
     fresh, old = new_track(pose, model), view.track
-    return replace(
+    return changed(
         fresh,
         number=old.number,
         side=old.side,
@@ -161,7 +161,7 @@ def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Tra
     shape, first = track.shape, model.configured.shape
     if not track.age.begun:
         shape = shape_fit.with_network_length(shape, detection.length_m, first)
-    return replace(track, shape=shape_fit.contradicted(shape, detection, first))
+    return changed(track, shape=shape_fit.contradicted(shape, detection, first))
 
 
 def expected_of(detection: Detection) -> Expected:
