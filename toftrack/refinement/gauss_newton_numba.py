@@ -446,10 +446,10 @@ class Refiner:
 
     def joints(self, states: Tensor) -> Tensor:
         """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
-        joints = torch.empty(len(states), 21, 3)
+        joints = np.empty((len(states), 21, 3), np.float32)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints.numpy(), _NO_FRAMES)
-        return joints
+        joints_of(states_read, *self._shape, joints, _NO_FRAMES)
+        return torch.from_numpy(joints)
 
     def pose(self, states: Tensor) -> HandPose:
         """(N, 27) to joints and frames, see skeleton.forward_kinematics."""

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.errors import ToftrackError, check_number
 from toftrack.hand.shape import HandShape
 from toftrack.render.scoring import Counts, Evidence, Scorer
@@ -43,21 +44,12 @@ class Likelihood:
 
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
-        # A model surface at an occluder is hidden, not false; at another hand only behind it.
-        given = observation.depth_m, observation.hand, observation.occluder
-        depth_m, hand, occluder = (image.cpu().numpy() for image in given)
-        front, tolerance_m = np.zeros_like(depth_m), np.float32(self.tolerance_m)
-        if observation.other is not None:
-            read = observation.other.cpu().numpy() & (depth_m > 0)
-            front[read] = 1 / depth_m[read]
-        front[occluder] = np.inf
-        if observation.thing is not None:
-            front[observation.thing.cpu().numpy()] = np.inf
-        low, high = np.full_like(depth_m, np.inf), np.full_like(depth_m, -np.inf)
-        z = depth_m[hand]
-        low[hand], high[hand] = 1 / (z + tolerance_m), 1 / np.maximum(z - tolerance_m, _LEAST_M)
-        device = observation.depth_m.device
-        lowest, highest, hidden = (torch.from_numpy(a).to(device) for a in (low, high, front))
+        seen, nothing = observation, torch.zeros(0, 0, dtype=torch.bool)
+        given = seen.hand, seen.occluder, seen.other, seen.thing
+        masks = [(nothing if mask is None else mask).cpu().numpy() for mask in given]
+        images = np.empty((3, *seen.depth_m.shape), np.float32)
+        _band(seen.depth_m.cpu().numpy(), *masks, np.float32(self.tolerance_m), images)
+        lowest, highest, hidden = torch.from_numpy(images).to(seen.depth_m.device)
         distance_m = 1.0 if observation.empty else observation.nearest_m
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
         return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)
@@ -78,6 +70,26 @@ class Likelihood:
     def scorer(self, shape: HandShape, given: Scorer) -> Scorer:
         """What makes the counts of a hand; that of the back end unless a head wants more of it."""
         return given
+
+
+@entry_point
+def _band(depth, hand, occluder, other, thing, tolerance, images):
+    """low, high and occluder of an Evidence, into images (3, H, W); other, thing: may be (0, 0).
+
+    A model surface at an occluder is hidden, not false; at another hand only behind it.
+    """
+    inverse, never = np.float32(1), np.float32(np.inf)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z, low, high, hidden = depth[v, u], never, -never, np.float32(0)
+            if hand[v, u]:
+                low = inverse / (z + tolerance)
+                high = inverse / max(z - tolerance, _LEAST_M)
+            if len(other) and other[v, u] and z > 0:
+                hidden = inverse / z
+            if occluder[v, u] or (len(thing) and thing[v, u]):
+                hidden = never
+            images[0, v, u], images[1, v, u], images[2, v, u] = low, high, hidden
 
 
 @dataclass(frozen=True)

@@ -59,8 +59,10 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
     for row, hand in enumerate(hands):
         sigma = _STEP_M + _SPEED_M_S * (hand.track.believed_s + dt_s)
         for column, one in enumerate(seen):
+            if one.row != row and (one.row >= 0 or one.side != hand.track.side):
+                continue
             away = float(np.linalg.norm(one.detection.centre_m.numpy() - hand.palm_m[0])) / sigma
-            if one.row == row or (one.row < 0 and one.side == hand.track.side and away < _GATE):
+            if one.row == row or away < _GATE:
                 cost[row, column] = 0.5 * away**2 - merit(one.detection, one.detection.heat)
     return cost
 

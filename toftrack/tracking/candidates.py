@@ -153,7 +153,7 @@ def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: floa
 
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
     """(H, 27) the likely hypotheses, `count` at most, as poses of a hand; the best one at least."""
-    likely = int((detection.log_probability > math.log(_UNLIKELY)).sum())
+    likely = int((detection.log_probability.numpy() > math.log(_UNLIKELY)).sum())
     return detection.first(max(1, min(count, likely))).states(fitted.ratio)
 
 
