@@ -108,8 +108,8 @@ def beside(task: Callable[[], Result]) -> Callable[[], Result]:
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    """Helper threads of this process."""
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="toftrack")
+    """Helper threads of this process: one less than cores, for who asks goes on computing."""
+    return ThreadPoolExecutor(max((os.cpu_count() or 1) - 1, 1), "toftrack")
 
 
 def _in_a_forked_process() -> None:
