@@ -7,7 +7,6 @@ fails the run, so that no test falls asleep unnoticed.
 
 from __future__ import annotations
 
-import copy
 import functools
 import os
 import re
@@ -103,9 +102,8 @@ def _loaded_once():
             def networks(path=None):
                 if path:
                     return load(path)
-                pair = known(weights.DEFAULT_FILE)
                 # On a GPU torch's are moved there.
-                return [type(one)(copy.deepcopy(one.reference), one.session) for one in pair]
+                return [type(one)(one.weights, one.session) for one in known(weights.DEFAULT_FILE)]
 
             patch.setattr(detector, "load_networks", networks)
         yield

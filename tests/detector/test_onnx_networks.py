@@ -163,7 +163,7 @@ def test_outputs_of_another_shape_never_reach_compiled_code(weights: Path) -> No
 
     crops = np.zeros((1, CROP_CHANNELS, CROP, CROP), np.float32)
     with pytest.raises(ToftrackError, match="is of another network"):
-        OnnxPoseNet(pose.reference, Other()).outputs(crops)
+        OnnxPoseNet(weights, Other()).outputs(crops)
 
 
 def test_several_threads_and_batches_get_the_same_answers() -> None:

@@ -11,15 +11,16 @@ import functools
 import hashlib
 import logging
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, ClassVar, Generic, Self, TypeVar, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.detector.network import CELLS, JOINTS, REPORTED, SEGMENTS, Finder, Found, PoseNet
-from toftrack.detector.weights import load_weights
+from toftrack.detector.weights import load_weights, read_metadata, weights_file
 from toftrack.errors import ToftrackError
 from toftrack.files.safe_files import open_to_read
 
@@ -38,11 +39,17 @@ Network = TypeVar("Network", PoseNet, Finder)
 
 @dataclass(frozen=True, eq=False)
 class OnnxNetwork(Generic[Network]):
-    """A network for the CPU; reference: the one that it was made of."""
+    """A network for the CPU.  weights: the file of the one that it was made of."""
 
-    reference: Network
+    weights: Path
     session: Any
     device = torch.device("cpu")
+    name: ClassVar[str]
+
+    @cached_property
+    def reference(self) -> Network:
+        """The network that it was made of, read when it is asked for: a GPU needs it."""
+        return cast(Network, getattr(load_weights(self.weights), self.name))
 
     def to(self, device: torch.device) -> Network | Self:
         """Itself on the CPU, elsewhere the reference."""
@@ -51,6 +58,8 @@ class OnnxNetwork(Generic[Network]):
 
 class OnnxPoseNet(OnnxNetwork[PoseNet]):
     """A PoseNet for the CPU."""
+
+    name = "pose"
 
     def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Of crops (N, CROP_CHANNELS, 64, 64): what PoseNet.features returns; without the lock.
@@ -72,6 +81,8 @@ class OnnxPoseNet(OnnxNetwork[PoseNet]):
 class OnnxFinder(OnnxNetwork[Finder]):
     """A Finder for the CPU."""
 
+    name = "finder"
+
     def __call__(self, images: Tensor) -> Found:
         """See network.Finder."""
         found = self.session.run(Found._fields, {"images": images.numpy()})
@@ -86,19 +97,21 @@ def load_networks(
     path: of the weights; None: those of the package.
     Raises ToftrackError when a file is damaged, or the weights are missing.
     """
-    weights = load_weights(path)
+    weights = weights_file(path)
+    sha256 = read_metadata(weights).get("sha256")
     sessions = []
     for network in ("pose", "finder"):
-        file = onnx_file(weights.path, network)
-        session = read_session(file, weights.path)
+        file = onnx_file(weights, network)
+        session = read_session(file, weights)
         known = session is not None
-        if not known or _made_of(session) != (FORMAT, VERSION, network, weights.sha256):
+        if not known or _made_of(session) != (FORMAT, VERSION, network, sha256):
             why = f"{file} is of other weights" if known else f"there is no {file}"
-            _warn(f"{why}: torch runs the detector's networks, slower; {_make(weights.path)}")
-            return weights.pose, weights.finder
+            _warn(f"{why}: torch runs the detector's networks, slower; {_make(weights)}")
+            loaded = load_weights(weights)
+            return loaded.pose, loaded.finder
         sessions.append(session)
     pose, finder = sessions
-    return OnnxPoseNet(weights.pose, pose), OnnxFinder(weights.finder, finder)
+    return OnnxPoseNet(weights, pose), OnnxFinder(weights, finder)
 
 
 def onnx_file(weights: Path, network: str) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -63,7 +63,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
 
     Raises ToftrackError when the file is missing, damaged, not weights or of another version.
     """
-    path = DEFAULT_FILE if path is None else Path(path)
+    path = weights_file(path)
     arrays, metadata = read_arrays(path)
     with other_networks_refused(path):
         pose = PoseNet(network_width(metadata, "pose"))
@@ -73,6 +73,11 @@ def load_weights(path: str | Path | None = None) -> Weights:
     make_ready(pose)
     make_ready(finder)
     return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
+
+
+def weights_file(path: str | Path | None = None) -> Path:
+    """A file of weights; None: the package's."""
+    return DEFAULT_FILE if path is None else Path(path)
 
 
 @contextmanager
@@ -105,10 +110,25 @@ def network_tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tenso
 
 def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and metadata of a file that is whole."""
+    arrays, metadata = _read(path)
+    if metadata.get("sha256") != checksum(arrays):
+        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
+    return arrays, metadata
+
+
+def read_metadata(path: Path) -> dict[str, Any]:
+    """What a file says of itself. Raises ToftrackError when it is no file of weights."""
+    return _read(path, ("metadata",))[1]
+
+
+def _read(
+    path: Path, names: Collection[str] | None = None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Arrays, or those of some names, and metadata of a file."""
     try:
         if path.stat().st_size > _LARGEST_BYTES:
             raise ToftrackError(f"{path} is too large for weights of the detector; {_AGAIN}")
-        arrays = read_archive(path)
+        arrays = read_archive(path, names)
         metadata = parse_json(str(arrays.pop("metadata")))
     except FileNotFoundError:
         raise ToftrackError(f"there are no weights of the detector at {path}; {_AGAIN}") from None
@@ -123,8 +143,6 @@ def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
             f" version {VERSION}; {_AGAIN}"
         )
-    if metadata.get("sha256") != checksum(arrays):
-        raise ToftrackError(f"{path} is damaged, its checksum is wrong; {_AGAIN}")
     return arrays, metadata
 
 

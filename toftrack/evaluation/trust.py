@@ -22,7 +22,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.statistics import figure, share_pct
@@ -161,6 +160,8 @@ def slots_of_hands(
     joints_m: (T, S, J, 3) metres, camera frame.  lost: (T, S) bool.
     Raises ToftrackError: as `judged`, or there are no slots, or fewer than hands.
     """
+    from scipy.optimize import linear_sum_assignment  # a fifth of a second, which few runs need
+
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
     fits = estimate.ndim == 4 and lost.shape == estimate.shape[:2]
     if not fits or estimate.shape[1] < len(hands):

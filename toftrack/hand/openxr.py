@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rotations import unitquat_to_rotmat
 from toftrack.hand.regions import lengths
@@ -138,6 +137,8 @@ def openxr_hand(joints_m: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> Open
 
 def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.ndarray, np.ndarray]:
     """(N, 21, 3) and (N, 27) to positions (N, 26, 3) and quaternions (N, 26, 4) in the world."""
+    from scipy.spatial.transform import Rotation  # a tenth of a second, which few runs need
+
     palm = Rotation.from_rotvec(state[:, 3:6]).as_matrix()
     if rig.mirrored:
         palm = palm * np.array([-1.0, 1.0, 1.0])

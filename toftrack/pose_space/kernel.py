@@ -17,7 +17,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
@@ -74,6 +73,8 @@ def _regression(latents: np.ndarray, angles: np.ndarray) -> tuple[float, dict[st
     Returns the root mean square error over the validation poses and angles, rad, and the fields of
     a KernelDecodedSpace that follow from the latents.
     """
+    from scipy.linalg import cho_factor, cho_solve  # which only learning needs
+
     count = len(latents)
     order = np.random.default_rng(0).permutation(count)
     parts = np.array_split(order, min(_FOLDS, count))

@@ -134,10 +134,9 @@ def _surprise(probability: float) -> float:
 
 def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
     """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
-    seen = np.empty((len(joints), 1))
-    read_around(joints.numpy(), depth_m.numpy(), k.numpy(), 0.0, seen)
-    z = np.maximum(joints[:, 2].numpy(), _NEAREST_M)
-    behind = (seen[:, 0] > 0) & (seen[:, 0] < z - _BEHIND_M)
+    at, seen = joints.double().numpy(), np.empty((len(joints), 1))
+    read_around(at, depth_m.numpy(), k.double().numpy(), 0.0, seen)
+    behind = (seen[:, 0] > 0) & (seen[:, 0] < np.maximum(at[:, 2], _NEAREST_M) - _BEHIND_M)
     return float(np.isnan(seen).mean()), float(behind.mean())
 
 
