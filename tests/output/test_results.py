@@ -178,6 +178,12 @@ def test_summary_counts_and_averages(tmp_path: Path) -> None:
     assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
 
 
+def test_a_first_run_s_compiling_is_not_the_time_of_a_frame(tmp_path: Path) -> None:
+    slow = [estimate(i, compute_s=9.0 if i == 0 else 0.01) for i in range(5)]
+    line = metrics_table(write(tmp_path, slow).summary).splitlines()[1]
+    assert "10.0 ms (100.0 frames/s), the median; the mean, 1808.0 ms, holds what is" in line
+
+
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     estimates = [estimate(i) for i in range(12)]
     truth = truth_of(estimates, frames=20)  # the run was interrupted after 12 of 20

@@ -161,6 +161,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     likely = likely or next(iter(same), None)
     text = f"there is no setting {key}"
     if key == "device.path":
+        if "device.bag" in keys:
+            return f"{text} of this device; its recordings are given as device.bag=FILE"
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
     if likely is not None:
         return f"{text}; did you mean {likely}?"

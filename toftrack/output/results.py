@@ -217,7 +217,8 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
-    """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
+    """The content of a track.npz: its arrays, with those of `facts_for_readers` as they are now,
+    `joint_names` as a tuple and `metadata` as a dict.
 
     Of a run with `hands=N` above 1 all arrays but index, timestamp_s, compute_s and dropped have
     an axis of N slots behind that of the frames.
@@ -233,6 +234,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content["metadata"] = parse_json(content["metadata"].item())
         if not isinstance(content["metadata"], dict):
             raise ValueError("the metadata are no object")
+        content |= facts_for_readers(content["metadata"])
         _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
     except OSError as error:
         raise ToftrackError(

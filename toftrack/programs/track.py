@@ -141,7 +141,11 @@ class Run:
         """What is to be said of the run at its end."""
         dropped = tuple(filter(None, (self.realtime.words(),)))
         # Hands are lost, too, where most frames are dropped.
-        return dropped if self.realtime.too_slow else dropped + self.watch.advice(self._told())
+        advice = () if self.realtime.too_slow else self.watch.advice(self._told())
+        if advice and (doubts := self.device.description.get("doubts")):
+            # What else would be said may follow from it, and contradict it.
+            advice = advice[0], f"First see to what was doubted at the start: {doubts[0]}."
+        return dropped + advice
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:
         """All frames, and the results' files; the view may stay after that."""
