@@ -117,10 +117,7 @@ _PLAIN = (
     *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
     *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
 )
-
-
-_MAIN_AXES = ("ray", "along", "across")
-"""Of hand/regions.py: the camera's ray, along the finger, across both."""
+_MAIN_AXES = ("ray", "along", "across")  # of hand/regions.py
 
 
 def csv_of(results: Mapping[str, Any]) -> str:

@@ -142,9 +142,10 @@ class Run:
         dropped = tuple(filter(None, (self.realtime.words(),)))
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
-        if advice and (doubts := self.device.description.get("doubts")):
-            # What else would be said may follow from it, and contradict it.
-            advice = advice[0], f"First see to what was doubted at the start: {doubts[0]}."
+        if advice[1:] and (doubts := self.device.description.get("doubts")):
+            # What there is to try may contradict it: hold nearer what is of another unit.
+            advised = (f"If that is as it should be: {more}" for more in advice[1:])
+            advice = advice[0], f"First see to what was doubted: {doubts[0]}.", *advised
         return dropped + advice
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:

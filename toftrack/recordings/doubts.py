@@ -46,7 +46,7 @@ def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
     times = store.timestamp_s
     counted = np.array_equal(times, np.arange(len(store)) / store.fps)
     of_time = (counted and names_doubt(store.names)) or times_doubt(times)
-    found = (_images_doubt(store), of_time, centre_doubt(camera), lens_doubt(camera))
+    found = (_images_doubt(store), centre_doubt(camera), of_time, lens_doubt(camera))
     return tuple(filter(None, found))
 
 
