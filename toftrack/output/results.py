@@ -254,11 +254,13 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 def estimates_of(results: dict[str, Any], row: int) -> tuple[Estimate, ...]:
     """What the tracker said about one frame of `read_results`, one a slot."""
-    found = []
+    found, camera = [], results["metadata"].get("camera") or {}
+    size_px = (camera["width"], camera["height"]) if "width" in camera else None
     for slot in np.ndindex(results["lost"].shape[1:]):
         places = {name: (row, *slot) if name in HAND_FIELDS else row for name in KINDS}
         values = {name: results[name][place] for name, place in places.items()}
-        found.append(Estimate(**{k: v if v.ndim else v.item() for k, v in values.items()}))
+        values = {k: v if v.ndim else v.item() for k, v in values.items()}
+        found.append(Estimate(**values, image_size_px=size_px))
     return tuple(found)
 
 
