@@ -361,6 +361,11 @@ def test_an_error_in_code_of_ones_own_names_class_file_and_line(
     assert status == 1 and f", in {place}" in err and f"{path}, line {line})" in err, err
 
 
+def test_a_number_in_place_of_a_choice_is_one_sentence(tmp_path: Path) -> None:
+    status, _, err = programs.call("likelihood=Nan", folder=tmp_path)
+    assert status == 1 and "a group was given a number" in err and "ValueError" not in err
+
+
 def test_toftrack_track_takes_a_folder_of_ones_own(mine: Path) -> None:
     folder, few = mine / "my_conf", ("device.stop=1", "filter.particles=20")
     words = ("device=mine", f"device.path={mine / 'images.npy'}", few[1])

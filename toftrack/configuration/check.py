@@ -83,7 +83,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     for word in overrides if of_file else ():
         if re.match(r"\+*pose_space\.(?!(dims|file|kind)\b|_)", word):
             raise ToftrackError(
-                f"{word} is of learning, and pose_space.file={space.file} is learned; leave one out"
+                f"{word} is of learning, and pose_space.file={space['file']} is learned; give one"
             )
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))

@@ -250,5 +250,5 @@ def table_of(columns: Columns, rows: Mapping[str, Mapping[str, Any]], first: str
 
 
 def _interval(total: Mapping[str, Any], key: str, digits: int) -> str:
-    ends = total.get(interval_name(key))
+    ends = total.get(interval_name(key)) if total["recordings"] > 1 else None
     return "" if ends is None else f"{text_of(ends[0], digits)}..{text_of(ends[1], digits)}"

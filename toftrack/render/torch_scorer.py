@@ -117,7 +117,7 @@ class TorchScorer:
 
 
 def rendered_depths(states: Tensor, shape: HandShape, evidence: Evidence) -> Tensor:
-    """(N, H, W) Z of hands (N, 27) as the evidence's camera sees them, m, 0 = no surface."""
+    """(N, H, W) Z in m of N > 0 hands (N, 27) as the evidence's camera sees them, 0 = none."""
     shape = shape.to(states.device)
     drawn = outlines(hand_surface(shape).pose(forward_kinematics(states, shape)), evidence.k)
     height, width = evidence.hand.shape

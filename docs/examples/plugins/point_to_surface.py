@@ -2,7 +2,7 @@
 along the ray, as model-based trackers of depth images often have it.
 
     toftrack track --config-dir docs/examples/plugins likelihood=point_to_surface \
-        experiment=paper lost.score=0.2 filter.exponent=10
+        experiment=paper lost.score=0.2 filter.exponent=20
 """
 
 from __future__ import annotations
