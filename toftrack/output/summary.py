@@ -286,7 +286,7 @@ def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
         ("joint error, mean", f"{text_of(metrics['mean_mm'])} mm"),
         ("joint error, median", f"{text_of(metrics['median_mm'])} mm"),
         ("fingertip error", f"{text_of(metrics['fingertip_mm'])} mm"),
-        ("wrist-aligned error", f"{text_of(metrics['wrist_aligned_mm'])} mm"),
+        ("wrist-aligned error", f"{text_of(metrics['wrist_aligned_mm'])} mm, wrists put together"),
         ("frames below 40 mm", f"{text_of(near)} %"),
     ]
     if metrics["missing_pct"]:

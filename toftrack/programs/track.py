@@ -115,6 +115,12 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
             _note(doubt)
+    threshold, score = config.lost.get("score"), summary.get("mean_score")
+    if None not in (threshold, score) and 2 * summary["lost_frames"] > summary["frames"]:
+        _note(
+            f"the mean score is {score:.2f}, and below lost.score={threshold:g}, which suits the"
+            " F-measure, a frame is lost; where the picture shows a hand that is followed, lower it"
+        )
     if ended is not None:
         raise ended
     if not summary.get("frames"):
