@@ -61,7 +61,7 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
     assert {field.name for field in dataclasses.fields(toftrack.Estimate)} == {
         *("index", "timestamp_s", "state_name", "lost", "joints_m", "state", "latent", "score"),
         *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
-        *("pinch", "pinching"),
+        *("pinch", "pinching", "image_size_px"),
         *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
         *("side", "side_probability", "joint_sigma_m", "joint_confidence", "joint_ok"),
         *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),

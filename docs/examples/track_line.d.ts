@@ -14,6 +14,8 @@ export interface Frame {
   timestamp_s: number;
   /** Wall seconds from the raw frame to the estimate. */
   compute_s: number | null;
+  /** Width and height of the image, pixels, which landmarks are in parts of; null where nobody says. */
+  image_size_px: [number, number] | null;
 }
 
 /** What is said of a hand. */
@@ -60,7 +62,7 @@ export interface Hand {
   pointing_origin_m: Vector;
   /** Unit vector from there to the finger's tip. */
   pointing_direction: Vector;
-  /** The joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z the depth beyond the wrist's in parts of the width. */
+  /** The joints as MediaPipe's landmarks: x, y in parts of the image's width and height (image_size_px), z the depth beyond the wrist's in parts of the width. */
   landmarks: Vector[];
   /** Metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward. */
   openxr_position_m: Vector[];

@@ -42,10 +42,17 @@ WRONG = [
     ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),
     ("particles=3", "did you mean filter.particles?"),
     ("devcie=replay", "there is no setting devcie; did you mean device?"),
+    ("device=realsense device.path=a.bag", "its recordings are given as device.bag=FILE"),
+    ("device=orbbec device.path=a.bag", "its recordings are given as device.bag=FILE"),
+    ("device=sr3000 device.path=a.npz", "by its name alone: toftrack track FILE"),
     ("view.quux=1", "there is no setting view.quux; view has "),
     ("quux=1", "there is no setting quux; the configuration has device, "),
     ("device.path=a.npz", "a recording is given by its name alone: toftrack track FILE"),
     ("device=replya", "there is no device=replya; did you mean device=replay? The choices are"),
+    ("pose_space=kpca", "there is no pose_space=kpca; did you mean pose_space=kernel_pca?"),
+    ("pose_space=pca,lle", "pose_space=pca,lle has several values; give one"),
+    ("seed=range(0,3)", "has several values; give one"),
+    ("pose_space.file=a.npz pose_space.data=natural", "data=natural is of learning, and pose_"),
     ("view=quux", "there is no view=quux; give one of browser, none, rerun, video"),
     ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
     (
@@ -112,7 +119,7 @@ def test_what_a_part_of_somebody_else_s_accepts_is_not_judged(tmp_path) -> None:
         (
             "lost/calibrated.yaml",
             ("toftrack.tracking.confidence.", "toftrack.tracking.mine."),
-            "the _target_ toftrack.tracking.mine.make_confidence cannot be imported",
+            "_target_ toftrack.tracking.mine.make_confidence cannot be imported.*of --config-dir",
         ),
         (
             "refine/gauss_newton.yaml",

@@ -33,6 +33,7 @@ from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
+from toftrack.pose_space.held_out import nearest_latents
 
 PAGE = (ROOT / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = dict(re.findall(r"<!-- test: extend (\S+) -->\n```\w+\n(.*?)```", PAGE, re.DOTALL))
@@ -258,6 +259,121 @@ def test_the_point_to_surface_likelihood_prefers_the_true_pose(
         estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
     assert type(tracker.model.likelihood).__name__ == "PointToSurface"
     assert 1e3 * np.linalg.norm(estimate.joints_m - scene.joints_m[2], axis=1).mean() < 25
+
+
+@pytest.mark.parametrize("given", [True, False])
+def test_a_likelihood_tracks_as_the_page_says_and_else_hears_of_its_threshold(
+    given: bool, tmp_path: Path
+) -> None:
+    (line,) = re.findall(r"^python track.py (.* likelihood=point_to_surface .*)$", PAGE, re.M)
+    words = line.replace("docs/examples/plugins", str(EXAMPLES)).split()
+    threshold = "lost.score=0.2"
+    assert threshold in words and any(word.startswith("filter.exponent=") for word in words)
+    kept = [word for word in words if given or word != threshold]
+    more = ("device.stop=5", "view=none", "hydra.run.dir=out")
+    status, _, err = programs.call(*kept, *more, folder=tmp_path)
+    assert status == 0, err
+    assert given == (
+        json.loads((tmp_path / "out" / "summary.json").read_text())["lost_frames"] == 0
+    )
+    assert given == (re.search(r"the mean score is 0\.3\d, and below lost.score=0.5", err) is None)
+
+
+PAPER = ("experiment=paper", "gestures=none", "hand.side=right")
+
+
+@pytest.mark.parametrize(
+    ("score", "said"),
+    [
+        ("counts.correct / union", r"gives \[nan, nan\] where correct is \[0.0, 0.0\]"),
+        ("counts.correct / union.clamp(min=1) - 1", r"gives \[-1.0, -1.0\]"),
+        ("counts.correct.mean()", "gives 0.0 where"),
+        ("1 / union.clamp(min=1)", r"gives \[1.0, 1.0\]"),
+        (
+            "counts.correct",
+            r"gives \[\d+.0\] where correct is \[\d+.0\]; let it give \(N,\) numbers",
+        ),
+    ],
+)
+def test_a_score_that_is_none_is_one_sentence(score: str, said: str, mine: Path) -> None:
+    module = mine / "my_conf" / "my_likelihood.py"
+    text = FILES[module.name]
+    assert "counts.correct / union.clamp(min=1)" in text
+    module.write_text(text.replace("counts.correct / union.clamp(min=1)", score))
+    with pytest.raises(ToftrackError, match=f"^likelihood: Overlap.score {said}") as caught:
+        tracker = toftrack.make_tracker("likelihood=mine", *PAPER, config_dir=mine / "my_conf")
+        tracker.step(sample().depth_m[0], sample().k)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_likelihood_of_rendered_depths_prefers_the_true_pose(mine: Path) -> None:
+    given = ("likelihood=depths", "filter.exponent=20", "lost.score=0.2", *PAPER)
+    tracker, scene = toftrack.make_tracker(*given, config_dir=mine / "my_conf"), sample()
+    for index in range(3):
+        estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
+    assert not estimate.lost
+    assert 1e3 * np.linalg.norm(estimate.joints_m - scene.joints_m[2], axis=1).mean() < 25
+
+
+def test_a_space_of_ones_own_is_measured_in_double_and_swept_from_its_file(mine: Path) -> None:
+    sys.path.append(str(mine / "my_conf"))
+    space = fit_pose_space("my_space.Independent", 4)
+    poses = space.decode(space.training_latents[:2])
+    assert nearest_latents(space, poses).dtype == torch.float64
+    assert space.encode(poses).dtype == torch.float32
+    (mine / "models").mkdir()
+    save_pose_space(space, mine / "models" / "mine.npz")
+    given = ("--config-dir", "my_conf", "-m", "pose_space=pca,saved", "device.stop=1", "view=none")
+    status, out, err = programs.call(*given, "hydra.sweep.dir=sweep", folder=mine)
+    assert status == 0 and "#1 pose_space=saved" in out, err
+    given = (f"pose_space.file={mine / 'models' / 'mine.npz'}", "pose_space=mine")
+    for words, said in (
+        ("pose_space.dims=3", "is a 4-dimensional Independent .*; give pose_space.dims=4$"),
+        (
+            "pose_space.iterations=5",
+            "^pose_space.iterations=5 is of learning, and pose_space.file=",
+        ),
+    ):
+        with pytest.raises(ToftrackError, match=said):
+            toftrack.make_tracker(*given, words, config_dir=mine / "my_conf")
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "place"),
+    [
+        ("my_space.py", "return self.mean", "return self.nope", "Independent.decode_freely ("),
+        (
+            "my_device.py",
+            "        self.images",
+            "        1 / 0\n        self.images",
+            "Millimetres.",
+        ),
+    ],
+)
+def test_an_error_in_code_of_ones_own_names_class_file_and_line(
+    file: str, old: str, new: str, place: str, mine: Path
+) -> None:
+    path = mine / "my_conf" / file
+    path.write_text(FILES[file].replace(old, new))
+    line = 1 + path.read_text()[: path.read_text().index(new.strip())].count("\n")
+    given = ("--config-dir", "my_conf", "pose_space=mine", "device=mine", "device.path=images.npy")
+    status, _, err = programs.call(*given, "view=none", folder=mine)
+    assert status == 1 and f", in {place}" in err and f"{path}, line {line})" in err, err
+
+
+def test_a_number_in_place_of_a_choice_is_one_sentence(tmp_path: Path) -> None:
+    status, _, err = programs.call("likelihood=Nan", folder=tmp_path)
+    assert status == 1 and "a group was given a number" in err and "ValueError" not in err
+
+
+def test_toftrack_track_takes_a_folder_of_ones_own(mine: Path) -> None:
+    folder, few = mine / "my_conf", ("device.stop=1", "filter.particles=20")
+    words = ("device=mine", f"device.path={mine / 'images.npy'}", few[1])
+    assert len(list(toftrack.track(*words, config_dir=folder))) == FRAMES
+    found = toftrack.track(mine / "images.raw16", "device=raw16", *few, config_dir=folder)
+    assert len(list(found)) == 1
+    with Sample(stop=1) as device:
+        assert len(list(toftrack.track(device, "pose_space=mine", config_dir=folder))) == 1
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import accuracy, runs
+from toftrack.evaluation import accuracy, results, runs
 from toftrack.programs import benchmark
 from toftrack.recordings.store import packaged_sample
 
@@ -101,6 +101,13 @@ def test_labelled_images_are_measured_too(folder, tmp_path, capsys) -> None:
     assert result["total"] is None and "named rightly %" in capsys.readouterr().out
 
 
+def test_one_recording_has_no_interval() -> None:
+    of = {"here": 2.0, "there": 1.0, "mean": 1.0, "low": 1.0, "high": 1.0}
+    rows = results.difference_table({"a": of | {"recordings": 1}, "b": of | {"recordings": 2}})[1:]
+    ends = [row[4:] for row in rows]
+    assert ends == [["-", "1", ""], ["+1.00 to +1.00", "2", "*"]]
+
+
 def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -115,6 +122,7 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
         ([str(folder), "--labels", str(tmp_path / "labels.json")], "cannot be read"),
         ([str(folder), "--json", str(tmp_path / "no" / "a.json")], "lies in none that there is"),
         ([str(folder), "hand.side=left"], "--side"),
+        ([str(folder), "pose_space=pca,lle"], "pose_space=pca,lle has several values; give one"),
     ]
     for arguments, reported in cases:
         with pytest.raises(ToftrackError) as error:

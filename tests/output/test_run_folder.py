@@ -42,6 +42,8 @@ def test_a_run_tells_its_arrays_times_camera_and_summary(tmp_path: Path) -> None
     run = toftrack.read_run(tmp_path)
     assert run.arrays["joints_m"].shape == (3, 21, 3) and run.timestamp_s.shape == (3,)
     assert all(isinstance(array, np.ndarray) for array in run.arrays.values())
+    assert run.arrays["angle_names"].tolist() == list(toftrack.ANGLE_NAMES)
+    assert "radians" in str(run.arrays["readme"])
     assert run.summary["frames"] == len(run) == 3
     assert (run.camera.width, run.camera.height) == (160, 120)
     np.testing.assert_array_equal(run.camera.K, camera.K)

@@ -217,7 +217,8 @@ def test_standard_output_is_the_stream_s_alone_and_the_table_goes_to_standard_er
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert done.stdout == (tmp_path / "out" / "track.jsonl").read_text()
-    assert tuple(json.loads(done.stdout.splitlines()[0])) == LINE_FIELDS
+    line = json.loads(done.stdout.splitlines()[0])
+    assert tuple(line) == LINE_FIELDS and line["image_size_px"] == [176, 144]
     assert "joint error, mean" in done.stderr and "track.npz" in done.stderr
     assert "stream: 6 estimates sent to standard output, 0 dropped" in done.stderr
 

@@ -119,7 +119,7 @@ def test_a_run_without_error_exits_with_zero(app: Path) -> None:
     ("arguments", "words"),
     [
         (["fail=clear"], "error: the reason, and what to do"),
-        (["fail=unexpected"], "ValueError: two lines (HYDRA_FULL_ERROR=1 shows the traceback)"),
+        (["fail=unexpected"], "app.py, line 23) (HYDRA_FULL_ERROR=1 shows the traceback)"),
         (["device=replay", "device.path=gone.npz"], "error: there is no file 'gone.npz'"),
         (["device=replay"], "device.path is missing; give it on the command line"),
         (["device=nope"], "there is no device=nope; give one of replay, sample"),
@@ -190,8 +190,8 @@ def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     assert err.splitlines() == [
         "error: #0 fail=clear: the reason, and what to do",
         "error: #1 fail=late: after three frames",
-        "error: #2 fail=unexpected: unexpected ValueError: two lines (HYDRA_FULL_ERROR=1 shows the"
-        " traceback)",
+        "error: #2 fail=unexpected: unexpected ValueError: two lines, in main"
+        f" ({app / 'app.py'}, line 23) (HYDRA_FULL_ERROR=1 shows the traceback)",
         "error: 3 of the jobs failed, see above",
     ]
 

@@ -37,7 +37,11 @@ def run_of(folder: Path, *sides: str | None) -> Path:
 
 
 def estimate(index: int, side: str | None) -> Estimate:
-    return lost_hand(index) if side is None else hand_estimate(index, side, bent=0.1 * index)
+    if side is None:
+        return lost_hand(index)
+    sigma, confidence = np.full((21, 3), 0.01, np.float32), np.full(21, 0.9, np.float32)
+    made = hand_estimate(index, side, bent=0.1 * index)
+    return made.updated(joint_sigma_m=sigma, joint_confidence=confidence)
 
 
 @pytest.fixture
@@ -103,6 +107,8 @@ def test_a_csv_has_a_row_a_frame_and_slot(sides: tuple[str | None, ...], tmp_pat
         assert (row["side"], row["lost"]) == ((sides[slot], "0") if there else ("", "1"))
         assert (row["wrist_x_m"] != "") == there
         assert (row["little_dip_flexion_rad"] != "") == there
+        sure = row["little_tip_confidence"], row["wrist_sigma_ray_m"], row["wrist_sigma_across_m"]
+        assert sure == (("0.9", "0.01", "0.01") if there else ("", "", ""))
 
 
 def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: Path) -> None:

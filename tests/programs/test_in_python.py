@@ -82,6 +82,7 @@ def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_pa
     assert again.content["metadata"] == results.content["metadata"]
     lines = [json.loads(line) for line in (tmp_path / "hand.jsonl").read_text().splitlines()]
     assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[0, 1]] * 3
+    assert lines[2]["image_size_px"] == [176, 144]
     with (tmp_path / "hand.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["index"], row["slot"]) for row in rows][-2:] == [("2", "0"), ("2", "1")]

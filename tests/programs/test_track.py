@@ -114,13 +114,20 @@ def test_the_summary_is_of_the_same_frames_and_holds_the_metrics(whole) -> None:
 
 
 def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
-    np.savez(tmp_path / "wall.npz", depth_m=np.full((3, 30, 40), 1.6, np.float32), K=K)
+    wall = np.full((3, 30, 40), 1.6, np.float32)
+    wall[:, 0, 0] = 1.5
+    np.savez(tmp_path / "wall.npz", depth_m=wall, K=K)
     status, out, err = here("device=replay", "device.path=wall.npz", "view=none")
     notes = [line for line in err.splitlines() if line.startswith("note: ")]
     assert status == 0 and "frames        3, 3 of them lost" in out
     assert len(notes) == 2
     assert "100 % of the pixels had readings, from 1.60 to 1.60 m" in notes[0]
     assert "segmentation.max_distance_m" in notes[1]
+    np.savez(tmp_path / "wall.npz", depth_m=4 * wall, K=K)
+    _, _, err = here("device=replay", "device.path=wall.npz", "view=none")
+    notes = [line for line in err.splitlines() if line.startswith("note: ")]
+    assert notes[1].startswith("note: First see to what was doubted: nearly all readings are")
+    assert all(note.startswith("note: If that is as it should be: ") for note in notes[2:])
 
 
 def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:

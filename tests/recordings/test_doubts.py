@@ -16,7 +16,7 @@ from toftrack.frames.camera import Camera
 from toftrack.frames.frame import checked_image
 from toftrack.output.advice import Watch
 from toftrack.output.summary import apparent_doubt, length_doubt
-from toftrack.recordings.doubts import lens_doubt, times_doubt
+from toftrack.recordings.doubts import centre_doubt, lens_doubt, names_doubt, times_doubt
 from toftrack.recordings.npz import read_recording
 
 K = np.array([[200.0, 0, 88], [0, 200, 72], [0, 0, 1]])
@@ -75,6 +75,52 @@ def test_a_lens_that_leaves_little_of_the_image_is_reported(distortion: list, wo
 )
 def test_lenses_of_cameras_are_not_doubted(distortion: list, lens: str) -> None:
     assert lens_doubt(Camera(K, 176, 144, distortion, lens=lens)) == ""
+
+
+@pytest.mark.parametrize(
+    ("centre", "words"),
+    [
+        ((88, 72), ""),
+        ((70, 80), ""),
+        ((176, 144), "its centre at 176, 144, as images of about 352x288 pixels have"),
+        ((44, 36), "images of about 88x72 pixels have, but these have 176x144"),
+        ((88, -20), "unless they are a part of larger ones"),
+    ],
+)
+def test_the_centre_of_another_resolution_is_reported(centre: tuple, words: str) -> None:
+    doubt = centre_doubt(Camera([[200, 0, centre[0]], [0, 200, centre[1]], [0, 0, 1]], 176, 144))
+    assert words in doubt and bool(doubt) == bool(words)
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        ("depth_{:04}.png 1 2 3 7 8 10", "leave out 4, the first between 'depth_0003.png' and"),
+        ("{}.png 0 2 3", "leave out 1, the first between '0.png' and '2.png'"),
+        ("s2/depth_{}_v1.png 10 20 50", "leave out 2"),
+        ("depth_{:04}.png 3 4 5", ""),
+        ("{}.png 0 5 10 15", ""),  # every fifth was kept
+        ("{}.png 1700000033 1700000066 1700000100 1700000133", ""),  # milliseconds
+        ("{}.png 4", ""),
+        ("{} ", ""),
+    ],
+)
+def test_numbers_missing_in_names_are_reported(names: str, words: str) -> None:
+    name, *numbers = names.split()
+    doubt = names_doubt([name.format(int(number)) for number in numbers])
+    assert words in doubt and bool(doubt) == bool(words)
+
+
+def test_a_folder_with_missing_numbers_is_doubted_until_it_has_times(tmp_path: Path) -> None:
+    with make_device("device=sample", "device.stop=3") as sample:
+        for frame, number in zip(sample, (1, 2, 5), strict=True):
+            image = (1000 * frame.depth).astype(np.uint16)
+            cv2.imwrite(str(tmp_path / f"depth_{number}.png"), image)
+    folder = Folder(tmp_path, intrinsics=[200, 200, 88, 72])
+    assert folder.description["files"] == ["depth_1.png", "depth_2.png", "depth_5.png"]
+    assert "between 'depth_2.png' and 'depth_5.png'" in folder.description["doubts"][0]
+    (tmp_path / "timestamps.txt").write_text("0.04\n0.08\n0.2\n")
+    assert Folder(tmp_path, intrinsics=[200, 200, 88, 72]).description["doubts"] == []
 
 
 @pytest.mark.parametrize("kind", [np.float32, np.uint16])

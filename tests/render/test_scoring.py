@@ -22,7 +22,7 @@ from toftrack.render.numba import kernel
 from toftrack.render.numba.vector import WORDS
 from toftrack.render.reference import ReferenceScorer, step_range_images
 from toftrack.render.scoring import Counts, Evidence, dilate_disc, disc_square, disc_steps
-from toftrack.render.torch_scorer import outlines
+from toftrack.render.torch_scorer import outlines, rendered_depths
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -353,6 +353,20 @@ def test_outlines_are_those_of_the_dual_conics() -> None:
         seen = conics.visible
         torch.testing.assert_close(middle[seen], expected[0][seen], atol=1e-3, rtol=1e-5)
         torch.testing.assert_close(half[seen], expected[1][seen], atol=1e-3, rtol=1e-4)
+
+
+def test_rendered_depths_are_those_of_the_closed_form() -> None:
+    shape, states = default_hand_shape(), random_states(6, (0.3, 0.7), 5)
+    states[0, 0], states[1, 2] = 9.0, -0.5  # beside the image, and behind the camera
+    for shown in (states, states[:1]):
+        evidence = random_evidence(shape, 48, 64, 4.0, 0.5, 6)
+        posed = hand_surface(shape).pose(forward_kinematics(shown, shape))
+        posed = Ellipsoids(posed.centres_m[:, :-1], posed.axes_m[:, :-1])  # without the wrist
+        found = rendered_depths(shown, shape, evidence)
+        right = render_range_images(posed, evidence.k, 48, 64)
+        assert found.shape == right.shape and ((found > 0) != (right > 0)).sum() <= 2
+        both = (found > 0) & (right > 0)
+        torch.testing.assert_close(found[both], right[both], atol=1e-3, rtol=0)
 
 
 @entry_point

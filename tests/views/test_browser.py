@@ -162,10 +162,11 @@ def test_anything_but_a_command_with_the_token_is_refused(view, visitor, message
     assert view.commands() == []
 
 
-def test_pages_of_other_sites_may_neither_watch_nor_command(view) -> None:
+def test_pages_of_other_sites_may_neither_watch_nor_command(view, caplog) -> None:
     for origin in ("http://evil.example", "null"):
         with pytest.raises(InvalidStatus, match="403"):
             Visitor(view.url, Origin=origin)
+        assert f"may not listen: only {view.url} may" in caplog.records[-1].getMessage()
     with Visitor(view.url, Origin=view.url.rstrip("/")) as own:
         assert own.first["phase"] == "starting"
 

@@ -10,6 +10,7 @@ accepts, nobody knows.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 
 from hydra.core.global_hydra import GlobalHydra
@@ -77,6 +78,13 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     name: of the configuration file.  overrides: of the command line.
     """
     check_tracker(config)
+    space = config.get("pose_space") or {}
+    of_file = space.get("file") is not None and str(space.get("_target_")).startswith("toftrack.")
+    for word in overrides if of_file else ():
+        if re.match(r"\+*pose_space\.(?!(dims|file|kind)\b|_)", word):
+            raise ToftrackError(
+                f"{word} is of learning, and pose_space.file={space['file']} is learned; give one"
+            )
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     chosen = [o for o in parsed if not o.is_delete() and loader.get_group_options(o.key_or_group)]

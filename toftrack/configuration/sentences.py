@@ -5,6 +5,8 @@ from __future__ import annotations
 import difflib
 import os
 import re
+import sys
+import traceback
 from collections.abc import Iterator, Sequence
 
 import yaml
@@ -12,6 +14,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from toftrack.configuration.plugins import ENTRY_POINTS, installed
 from toftrack.errors import ToftrackError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -42,14 +45,29 @@ def sentence(error: BaseException) -> str:
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
         return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
-            "name, and that its module lies beside the program or on PYTHONPATH"
+            "name, and that its module lies in the folder of --config-dir, on PYTHONPATH, or is "
+            "installed"
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         reported = next((cause for cause in chain if str(cause).strip()), error)
-        return _of_override(chain) or _of_config(reported) or type(error).__name__
+        said = _of_config(reported) + _place(chain[-1])
+        return _of_override(chain) or said or type(error).__name__
     text = _one_line(str(error))
-    name = type(error).__name__
-    return f"unexpected {name}{f': {text}' if text else ''} ({FULL_ERROR}=1 shows the traceback)"
+    if text.startswith("Config group override must be"):
+        return "a group was given a number, as likelihood=nan; give a choice's name, GROUP=NAME"
+    name = type(error).__name__ + (f": {text}" if text else "") + _place(error)
+    return f"unexpected {name} ({FULL_ERROR}=1 shows the traceback)"
+
+
+def _place(error: BaseException) -> str:
+    """Where code of one's own raised it: class, file and line; "" where none did."""
+    theirs = {e.module.split(".")[0] for name in ENTRY_POINTS for e in installed(name).values()}
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        code, root = frame.f_code, str(frame.f_globals.get("__name__")).partition(".")[0]
+        ours = root == "toftrack" or root in sys.stdlib_module_names or code.co_filename[0] == "<"
+        if root in theirs or not (ours or "-packages" in code.co_filename):
+            return f", in {code.co_qualname} ({code.co_filename}, line {line})"
+    return ""
 
 
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
@@ -131,7 +149,8 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
     if not group or not options:
         return None
-    likely = _nearest(word, options)
+    shortened = re.compile(".*".join(map(re.escape, word))).match  # kpca, of kernel_pca
+    likely = next(filter(shortened, options), None) or _nearest(word, options)
     hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
     return f"there is no {group}={word}; {hint} {', '.join(options)}"
 
@@ -161,6 +180,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     likely = likely or next(iter(same), None)
     text = f"there is no setting {key}"
     if key == "device.path":
+        if "device.bag" in keys:
+            return f"{text} of this device; its recordings are given as device.bag=FILE"
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
     if likely is not None:
         return f"{text}; did you mean {likely}?"

@@ -110,7 +110,7 @@ class Replay(BaseDevice):
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
             "doubts": list(found),
-        }
+        } | ({"files": list(store.names)} if store.names else {})
 
     def close(self) -> None:
         self._recording.close()

@@ -210,7 +210,8 @@ def difference_table(differences: Mapping[str, Mapping[str, Any]]) -> Table:
     table = [["figure", "here", "there", "difference", "90 % interval", "recordings", ""]]
     for key, of in differences.items():
         cells = [f"{of[name]:.2f}" for name in ("here", "there")]
-        change = [f"{of['mean']:+.2f}", f"{of['low']:+.2f} to {of['high']:+.2f}"]
+        spread = f"{of['low']:+.2f} to {of['high']:+.2f}" if of["recordings"] > 1 else "-"
+        change = [f"{of['mean']:+.2f}", spread]
         table.append([key, *cells, *change, str(of["recordings"]), clear_mark(of)])
     return table
 
@@ -249,5 +250,5 @@ def table_of(columns: Columns, rows: Mapping[str, Mapping[str, Any]], first: str
 
 
 def _interval(total: Mapping[str, Any], key: str, digits: int) -> str:
-    ends = total.get(interval_name(key))
+    ends = total.get(interval_name(key)) if total["recordings"] > 1 else None
     return "" if ends is None else f"{text_of(ends[0], digits)}..{text_of(ends[1], digits)}"

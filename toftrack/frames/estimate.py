@@ -118,6 +118,8 @@ class Estimate:
     landmarks: ArrayOnDemand = ArrayOnDemand(21, 3)
     """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
     the depth beyond the wrist's in parts of the width; see hand/conventions.py."""
+    image_size_px: tuple[int, int] | None = None
+    """Width and height of the image, which `landmarks` are in parts of; None where nobody says."""
     openxr_position_m: ArrayOnDemand = ArrayOnDemand(26, 3)
     """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
     openxr_orientation: ArrayOnDemand = ArrayOnDemand(26, 4)

@@ -29,18 +29,22 @@ _KINDS: dict[type, type] = {
 }
 _EXACT: dict[str, type] = {"timestamp_s": np.float64, "joint_ok": np.bool_}
 """Fields of another type than their kind's."""
+_OF_RUN = ("image_size_px",)
+"""What a line says of its frame, and track.npz once."""
 _HINTS = get_type_hints(Estimate)
 KINDS: dict[str, type] = {
-    field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]]) for field in fields(Estimate)
+    field.name: _EXACT.get(field.name, _KINDS[_HINTS[field.name]])
+    for field in fields(Estimate)
+    if field.name not in _OF_RUN
 }
 """Of what type each field is in track.npz; arrays have their shape behind the frames' axis."""
 _FIRST = (
     *("index", "timestamp_s", "state_name", "lost", "confidence", "outside_rad", "side"),
     *("side_probability", "score"),
 )
-LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST))
+LINE_FIELDS = (*_FIRST, *(name for name in KINDS if name not in _FIRST), *_OF_RUN)
 """What a line of track.jsonl says, fields of Estimate, in their order."""
-FRAME_FIELDS = ("index", "timestamp_s", "compute_s")
+FRAME_FIELDS = ("index", "timestamp_s", "compute_s", *_OF_RUN)
 """What is said of a frame, not of each hand in it."""
 DROPPED = "dropped"
 """The array of track.npz that says which frames a live run did not track, and what their
@@ -50,7 +54,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "joints_m": (21, 3),
     "state": (27,),
     "joint_ok": (21,),
-    **{name: () for name, hint in _HINTS.items() if hint not in (np.ndarray, ArrayOnDemand)},
+    **{name: () for name in KINDS if _HINTS[name] not in (np.ndarray, ArrayOnDemand)},
 }
 """Of the fields of a hand whose shape does not depend on the run."""
 

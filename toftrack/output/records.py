@@ -168,7 +168,7 @@ class Records:
         slots = [self._vacant] * self.slots
         for hand in line["hands"]:
             slots[hand["slot"]] = hand
-        frame = {name: line[name] for name in FRAME_FIELDS}
+        frame = {name: line[name] for name in FRAME_FIELDS if name in KINDS}
         return frame | {name: [hand[name] for hand in slots] for name in self._vacant}
 
 

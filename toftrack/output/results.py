@@ -217,7 +217,8 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
 
 def read_results(path: str | Path) -> dict[str, Any]:
-    """The content of a track.npz: its arrays, `joint_names` as a tuple and `metadata` as a dict.
+    """The content of a track.npz: its arrays, with those of `facts_for_readers` as they are now,
+    `joint_names` as a tuple and `metadata` as a dict.
 
     Of a run with `hands=N` above 1 all arrays but index, timestamp_s, compute_s and dropped have
     an axis of N slots behind that of the frames.
@@ -233,6 +234,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content["metadata"] = parse_json(content["metadata"].item())
         if not isinstance(content["metadata"], dict):
             raise ValueError("the metadata are no object")
+        content |= facts_for_readers(content["metadata"])
         _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
     except OSError as error:
         raise ToftrackError(
@@ -252,11 +254,13 @@ def read_results(path: str | Path) -> dict[str, Any]:
 
 def estimates_of(results: dict[str, Any], row: int) -> tuple[Estimate, ...]:
     """What the tracker said about one frame of `read_results`, one a slot."""
-    found = []
+    found, camera = [], results["metadata"].get("camera") or {}
+    size_px = (camera["width"], camera["height"]) if "width" in camera else None
     for slot in np.ndindex(results["lost"].shape[1:]):
         places = {name: (row, *slot) if name in HAND_FIELDS else row for name in KINDS}
         values = {name: results[name][place] for name, place in places.items()}
-        found.append(Estimate(**{k: v if v.ndim else v.item() for k, v in values.items()}))
+        values = {k: v if v.ndim else v.item() for k, v in values.items()}
+        found.append(Estimate(**values, image_size_px=size_px))
     return tuple(found)
 
 

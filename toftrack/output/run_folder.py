@@ -57,7 +57,8 @@ class Run:
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         """What was estimated, by name: the fields of Estimate, each with a row a frame, as
-        `joints_m` (T, 21, 3); with `hands=N` (T, N, 21, 3). docs/formats.md lists them.
+        `joints_m` (T, 21, 3), with `hands=N` (T, N, 21, 3), and those of the whole run, as
+        `angle_names`. docs/formats.md lists them.
         """
         return {
             name: value for name, value in self.results.items() if isinstance(value, np.ndarray)

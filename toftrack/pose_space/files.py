@@ -201,9 +201,9 @@ def make_pose_space(
     space = load_pose_space(file, kind)
     wanted = kind_of_space(kind)[0].kind
     if space.kind != wanted or space.dims != dims:
+        choice = "" if space.kind == wanted else f"pose_space={space.kind} "
         raise ToftrackError(
             f"{file} is a {space.dims}-dimensional {space.kind} space and the configuration"
-            f" asks for a {dims}-dimensional {wanted}; give pose_space={space.kind}"
-            f" pose_space.dims={space.dims}"
+            f" asks for a {dims}-dimensional {wanted}; give {choice}pose_space.dims={space.dims}"
         )
     return space

@@ -74,7 +74,7 @@ def start(
         sys.argv = before
 
 
-def with_recording(arguments: Sequence[str]) -> list[str]:
+def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> list[str]:
     """The arguments with a file's name as overrides.
 
     What begins with a group or a setting and has a = is an override, whatever files there are.
@@ -108,7 +108,7 @@ def with_recording(arguments: Sequence[str]) -> list[str]:
         )
     device = next((word for word in others if word.startswith("device=")), None)
     if device is not None and device.removeprefix("device=") not in devices_of_files(
-        config_folders(arguments)
+        [*config_folders(arguments), *folders]
     ):
         raise ToftrackError(
             f"{device} and the recording '{files[0]}' both give the frames; leave one out"

@@ -117,6 +117,7 @@ _PLAIN = (
     *("state_name", "lost", "dropped", "confidence", "side", "side_probability", "score"),
     *("outside_rad", "gesture", "gesture_probability", "pinch", "pinching"),
 )
+_MAIN_AXES = ("ray", "along", "across")  # of hand/regions.py
 
 
 def csv_of(results: Mapping[str, Any]) -> str:
@@ -144,6 +145,8 @@ def table_of(results: Mapping[str, Any]) -> Iterator[list[Any]]:
         "joints_m": [f"{joint}_{axis}_m" for joint in joints for axis in "xyz"],
         "joint_ok": [f"{joint}_ok" for joint in joints],
         "state": [f"{angle}_rad" for angle in ANGLE_NAMES],  # the last of its numbers
+        "joint_confidence": [f"{joint}_confidence" for joint in joints],
+        "joint_sigma_m": [f"{joint}_sigma_{axis}_m" for joint in joints for axis in _MAIN_AXES],
     }
     arrays = {name: np.asarray(results[name]) for name in titles if name in results}
     of_arrays = chain.from_iterable(titles[name] for name in arrays)

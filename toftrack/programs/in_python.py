@@ -35,7 +35,11 @@ if TYPE_CHECKING:
     import pandas
 
 
-def track(source: str | os.PathLike[str] | BaseDevice, *overrides: str) -> Tracking:
+def track(
+    source: str | os.PathLike[str] | BaseDevice,
+    *overrides: str,
+    config_dir: str | Path | None = None,
+) -> Tracking:
     """Track the hands of a recording or camera, as `toftrack track` with the same words does.
 
         for estimate in toftrack.track("hand.npz", "hands=2"):
@@ -46,7 +50,7 @@ def track(source: str | os.PathLike[str] | BaseDevice, *overrides: str) -> Track
     record=FILE.npz; view=video puts its files into the working folder.
 
     source: a recording's name, an override that chooses a device ("device=sample"), or a device.
-    overrides: as on the command line.
+    overrides: as on the command line.  config_dir: as for make_tracker.
 
     Raises ToftrackError, as do the iteration and `results`: an override cannot be used, the device
     cannot deliver, or an override speaks of the device that was given.
@@ -58,8 +62,9 @@ def track(source: str | os.PathLike[str] | BaseDevice, *overrides: str) -> Track
                     f"{word} says where frames come from, but track was given a device, a "
                     f"{type(source).__name__}; leave one out"
                 )
-        return Tracking(configuration("view=none", *overrides), source)
-    config = configuration("view=none", *with_recording([os.fspath(source), *overrides]))
+        return Tracking(configuration("view=none", *overrides, config_dir=config_dir), source)
+    words = with_recording([os.fspath(source), *overrides], [str(config_dir)] if config_dir else [])
+    config = configuration("view=none", *words, config_dir=config_dir)
     with one_sentence():
         return Tracking(config, instantiate(config.device))
 

@@ -115,6 +115,12 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
             _note(doubt)
+    threshold, score = config.lost.get("score"), summary.get("mean_score")
+    if None not in (threshold, score) and 2 * summary["lost_frames"] > summary["frames"]:
+        _note(
+            f"the mean score is {score:.2f}, and below lost.score={threshold:g}, which suits the"
+            " F-measure, a frame is lost; where the picture shows a hand that is followed, lower it"
+        )
     if ended is not None:
         raise ended
     if not summary.get("frames"):
@@ -141,7 +147,12 @@ class Run:
         """What is to be said of the run at its end."""
         dropped = tuple(filter(None, (self.realtime.words(),)))
         # Hands are lost, too, where most frames are dropped.
-        return dropped if self.realtime.too_slow else dropped + self.watch.advice(self._told())
+        advice = () if self.realtime.too_slow else self.watch.advice(self._told())
+        if advice[1:] and (doubts := self.device.description.get("doubts")):
+            # What there is to try may contradict it: hold nearer what is of another unit.
+            advised = (f"If that is as it should be: {more}" for more in advice[1:])
+            advice = advice[0], f"First see to what was doubted: {doubts[0]}.", *advised
+        return dropped + advice
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:
         """All frames, and the results' files; the view may stay after that."""

@@ -6,7 +6,8 @@ be right: the run goes on.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,8 @@ _TIME_UNITS = (
     ("thousands of seconds", 1e-3),
 )
 """Names of units and how many of them a second has, the likeliest first."""
+_OFF_MIDDLE = 0.3
+"""Of the way from the image's middle to its border, beyond which a lens's centre is doubted."""
 _KEPT, _LEFT_BY_RIGHT_ONE = 0.7, 0.85
 """Share of the image that is left when a lens is undone: one that leaves less is doubted; one that
 may have been meant leaves more than the other."""
@@ -40,7 +43,10 @@ def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
 
     camera: of the images, which may be another one than the recording's.
     """
-    found = (_images_doubt(store), times_doubt(store.timestamp_s), lens_doubt(camera))
+    times = store.timestamp_s
+    counted = np.array_equal(times, np.arange(len(store)) / store.fps)
+    of_time = (counted and names_doubt(store.names)) or times_doubt(times)
+    found = (_images_doubt(store), centre_doubt(camera), of_time, lens_doubt(camera))
     return tuple(filter(None, found))
 
 
@@ -109,6 +115,36 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
                 return f"{what}; divide them by {in_a_second:.0f}, {remedy}"
             return f"{what}; multiply them by {1 / in_a_second:.0f}, {remedy}"
     return ""
+
+
+def names_doubt(names: Sequence[str]) -> str:
+    """What speaks against files, in their order, being all frames there were; "" for nothing."""
+    numbers = [re.findall(r"\d+", name) for name in names]
+    changing = [of for of in zip(*numbers, strict=False) if len(set(of)) > 1]
+    steps = np.diff([int(number) for number in changing[0]]) if len(changing) == 1 else np.zeros(0)
+    least = steps.min(initial=10**9)
+    # Steps of a clock, whose times may stand in names, too, are no multiples of the least one.
+    if least < 1 or (steps % least).any() or (steps == least).all():
+        return ""
+    first = int(np.argmax(steps > least))
+    return (
+        f"the numbers in the files' names leave out {int((steps // least - 1).sum())}, the first "
+        f"between '{names[first]}' and '{names[first + 1]}', but the frames are timed as if none "
+        "were missing; write the seconds of each into timestamps.txt (docs/formats.md)"
+    )
+
+
+def centre_doubt(camera: Camera) -> str:
+    """What speaks against a camera matrix being that of images of this size; "" for nothing."""
+    size, centre = np.array((camera.width, camera.height)), camera.K[:2, 2]
+    if (abs(2 * centre / size - 1) < _OFF_MIDDLE).all():
+        return ""
+    width, height = 2 * np.maximum(centre, 0.5)
+    return (
+        f"K has its centre at {centre[0]:g}, {centre[1]:g}, as images of about {width:.0f}x"
+        f"{height:.0f} pixels have, but these have {size[0]}x{size[1]}; give K of this size, unless"
+        " they are a part of larger ones"
+    )
 
 
 def lens_doubt(camera: Camera) -> str:

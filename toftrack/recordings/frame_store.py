@@ -30,6 +30,8 @@ class FrameStore:
     truth: Truth | None = None
     unit_m: float | None = None
     """Metres of one step, where the images are whole numbers."""
+    names: tuple[str, ...] = ()
+    """Of the frames' files, (T,), where each has one of its own."""
     damage: str | None = None
     """Why it ends earlier than it should, in words; None when it is whole."""
     left_out: str | None = None

@@ -149,6 +149,7 @@ class ImageFolder(FrameStore):
         self.unit_m, self.fps = float(unit_m), float(fps)
         times_s = _timestamps(files, depth)
         self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
+        self.names = tuple(depth)
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         depth = self._read(self._depth[index], self._kind).astype(np.float32)

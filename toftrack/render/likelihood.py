@@ -1,10 +1,4 @@
-"""The head that scores hypotheses against an observation (paper, section 2.3, "Observation").
-
-Two things that a sensor's noise suggests were tried and left out, for they bought nothing (mean
-error over eight recordings, 3 seeds). Leaving out flying pixels, those that agree with at most one
-or two neighbours: 5.1 mm with and without, and at twice the noise 7.0 instead of 6.7. A tolerance
-1.4 times as wide at twice the noise: 6.5. The residual weight and the tolerance's width cover both.
-"""
+"""The head that scores hypotheses against an observation (paper, section 2.3, "Observation")."""
 
 from __future__ import annotations
 
@@ -149,6 +143,17 @@ class FMeasure(Likelihood):
         rest = b2 * false + missed if printed else false + b2 * missed
         weighted = (1 + b2) * correct
         return weighted / (weighted + rest).clip(min=1e-9)
+
+
+def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
+    """(N,) its scores; ToftrackError where they are none as `Likelihood.score` has them."""
+    found, some = torch.as_tensor(likelihood.score(counts)), counts.correct > 0
+    if found.shape == some.shape and bool(((found >= 0) & (found <= 1.0001 * some)).all()):
+        return found
+    raise ToftrackError(
+        f"likelihood: {type(likelihood).__name__}.score gives {found.tolist()} where correct is"
+        f" {counts.correct.tolist()}; let it give (N,) numbers of 0 to 1, and 0 where that is 0"
+    )
 
 
 def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:

@@ -116,6 +116,19 @@ class TorchScorer:
         return Counts(*(torch.cat(counts, 1) if counts else states.new_zeros(4, 0)))
 
 
+def rendered_depths(states: Tensor, shape: HandShape, evidence: Evidence) -> Tensor:
+    """(N, H, W) Z in m of N > 0 hands (N, 27) as the evidence's camera sees them, 0 = none."""
+    shape = shape.to(states.device)
+    drawn = outlines(hand_surface(shape).pose(forward_kinematics(states, shape)), evidence.k)
+    height, width = evidence.hand.shape
+    boxes, (left, top, right, bottom) = _boxes(drawn, width, height)
+    image = drawn.x.new_zeros(len(states), height, width)
+    if right > left and bottom > top:
+        u = _inverse_depth(drawn, boxes, (left, top, right, bottom))
+        image[:, top:bottom, left:right] = torch.where(u > 0, 1 / u, 0.0)
+    return image
+
+
 def _score(o: Outlines, evidence: Evidence) -> Tensor:
     """(4, N) counts of one chunk."""
     height, width = evidence.hand.shape

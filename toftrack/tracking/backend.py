@@ -14,10 +14,10 @@ from toftrack.compute.rigid import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
 from toftrack.hand.surface import hand_surface
-from toftrack.render.likelihood import Likelihood
+from toftrack.render.likelihood import Likelihood, checked_score
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.numba.scorer import score_rows as score_rows_compiled
-from toftrack.render.scoring import Scorer, ScoreRows, score_rows
+from toftrack.render.scoring import Counts, Scorer, ScoreRows, score_rows
 from toftrack.render.torch_scorer import TorchScorer
 
 
@@ -41,6 +41,7 @@ class Backend:
 
     def judged_by(self, likelihood: Likelihood) -> Backend:
         """The same, with the scorers that a likelihood brings where it brings some."""
+        checked_score(likelihood, Counts(*torch.zeros(4, 2)))  # where nothing is seen
         if getattr(type(likelihood), "scorer", Likelihood.scorer) is Likelihood.scorer:
             return self
         make = self.make_scorer

@@ -17,7 +17,7 @@ from torch import Tensor
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import check_number
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.render.likelihood import Likelihood
+from toftrack.render.likelihood import Likelihood, checked_score
 from toftrack.render.scoring import Counts, Evidence, Scorer
 
 _FAR_SIGMAS = 3.0
@@ -62,8 +62,8 @@ class ImageTerm:
         return self.likelihood.log_score(self._counts(poses), self.coverage)
 
     def score(self, pose: Tensor) -> float:
-        """The F-measure, 0 .. 1, of a pose (1, 27)."""
-        return float(self.likelihood.score(self._counts(pose)))
+        """The F-measure, 0 .. 1, of a pose (1, 27); ToftrackError where it is none."""
+        return float(checked_score(self.likelihood, self._counts(pose)))
 
     def _counts(self, poses: Tensor) -> Counts:
         return Counts(*on_host(*self.scorer(on_device(poses, self.device), self.evidence)))

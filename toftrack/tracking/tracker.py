@@ -86,8 +86,8 @@ class HandsTracker:
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
             self.state, self.infos, estimates = _step(self.state, image, model)
-        took_s = self.time.took_s()
-        return tuple(estimate.updated(compute_s=took_s) for estimate in estimates)
+        of_frame = {"compute_s": self.time.took_s(), "image_size_px": depth_m.shape[::-1]}
+        return tuple(estimate.updated(**of_frame) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:

@@ -1,7 +1,8 @@
 """A likelihood of one's own: how far the seen points lie from the hand's surface, in space and not
 along the ray, as model-based trackers of depth images often have it.
 
-    toftrack track --config-dir docs/examples/plugins likelihood=point_to_surface
+    toftrack track --config-dir docs/examples/plugins likelihood=point_to_surface \
+        experiment=paper lost.score=0.2 filter.exponent=20
 """
 
 from __future__ import annotations

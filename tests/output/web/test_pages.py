@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
+from helpers.browsing import eventually
 from helpers.chromium import DRAWS_IN_3D, headless_chromium, picture, shown
 from helpers.hands import hand_estimate
 from helpers.settings import part
-from helpers.tracking import make_tracker
+from helpers.tracking import ROOT, make_tracker
 
 from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import Estimate
@@ -70,6 +73,19 @@ def test_the_hand_is_drawn_bends_and_becomes_grey_when_it_is_lost(stream: Any, p
     assert left.mean() > 0.03
 
 
+def test_a_bone_to_a_joint_that_is_not_ok_is_grey_and_of_one_piece(stream: Any, page: Any) -> None:
+    page.get(stream.url)
+    ok = np.arange(21) != 12  # the middle finger's tip
+    whole, doubted = (
+        select(page, stream, hand_estimate(index, joint_ok=flags))
+        for index, flags in ((1, np.ones(21, bool)), (2, ok))
+    )
+    top, lower = (np.nonzero(one.any(1))[0][0] for one in (whole, doubted))
+    assert lower > top + 10
+    grey = cv2.imdecode(np.frombuffer(page.get_screenshot_as_png(), np.uint8), 0)[60:-60]
+    assert (grey[top + 3 : lower] > 40).any(1).all()
+
+
 def test_several_hands_are_drawn(stream: Any, page: Any) -> None:
     both = hand_estimate(9), hand_estimate(9, "left")
     page.get(stream.url)
@@ -122,6 +138,44 @@ def rest(page: Any, aim: Callable[[], None]) -> None:
     until = time.monotonic() + 0.5
     while time.monotonic() < until:
         shown(page, "game.cursor !== null", aim)
+
+
+CURSOR_PAGE = """
+document.body.innerHTML = "<div id=cursor></div>";
+cursor.style = "position: fixed; left: 0; top: 0; pointer-events: none";
+window.clicks = [];
+for (let k = 0; k < 10; k++) {
+  const column = document.createElement("button");
+  column.style = `position: fixed; left: ${10 * k}%; width: 10%; top: 0; height: 100%`;
+  column.onclick = () => clicks.push(k);
+  document.body.append(column);
+}
+"""
+
+
+def test_the_docs_cursor_follows_the_fingertip_and_a_pinch_clicks_where_it_was(
+    stream: Any, page: Any
+) -> None:
+    text = (ROOT / "docs" / "streams.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"<!-- test: cursor -->\n```js\n(.*?)```", text, re.DOTALL)
+    page.get(f"{stream.url}feed.js")  # no page, but of this origin
+    eventually(lambda: not stream._server.clients)
+    assert "ws://127.0.0.1:8766/" in code
+    here = code.replace("ws://127.0.0.1:8766/", f"ws{stream.url.removeprefix('http')}")
+    page.execute_script(CURSOR_PAGE + here)
+    eventually(lambda: stream._server.clients)
+    not_ok, pinch, lost = {"joint_ok": np.zeros(21, bool)}, {"pinching": True}, {"lost": True}
+    frames = [(0.25, {})] * 10 + [(0.35, {})] * 5  # the fingers close
+    frames += [(0.45, pinch), (0.45, pinch), (0.9, pinch | not_ok), (0.9, lost), (0.45, pinch)]
+    frames += [(0.45, {})] * 8 + [(0.45, pinch)]
+    for index, (u, changes) in enumerate(frames):
+        landmarks = np.full((21, 3), (u, 0.5, 0.0))
+        stream.send((hand_estimate(index, landmarks=landmarks, **changes),))
+    assert shown(page, "clicks.length > 1 && clicks", lambda: None) == [7, 5]
+    *there, wide, high = page.execute_script(
+        "return [...cursor.style.translate.split(' ').map(parseFloat), innerWidth, innerHeight]"
+    )
+    assert there == pytest.approx([0.55 * wide, 0.5 * high], abs=0.1)
 
 
 GAME = "point?seed=15411478&width=1&reach=0.5"

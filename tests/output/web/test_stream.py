@@ -164,26 +164,32 @@ def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
 
 
 @pytest.mark.parametrize(
-    "headers",
+    "headers, words",
     [
-        {"Origin": "http://evil.example"},
-        {"Origin": "null"},
-        {"Origin": "https://127.0.0.1"},
-        {"Host": "evil.example", "Origin": "http://evil.example"},
-        {"Host": "127.0.0.1.evil.example"},
+        ({"Origin": "http://evil.example"}, "'stream.origins=[http://evil.example]'"),
+        ({"Origin": "null"}, "a page of no address may not listen: serve it from one"),
+        ({"Origin": "http://a]';reboot"}, "a page of no address"),
+        ({"Origin": "https://127.0.0.1"}, "'stream.origins=[https://127.0.0.1]'"),
+        ({"Host": "evil.example", "Origin": "http://evil.example"}, "stream.host=NAME"),
+        ({"Host": "127.0.0.1.evil.example"}, "localhost only"),
     ],
 )
-def test_pages_of_other_sites_may_not_listen(stream: WebSocketStream, headers: dict) -> None:
+def test_pages_of_other_sites_may_not_listen_which_the_log_says_once(
+    stream: WebSocketStream, headers: dict, words: str, caplog: pytest.LogCaptureFixture
+) -> None:
     upgrade = {"Upgrade": "websocket", "Connection": "Upgrade"}
-    status, _, reported = answer(stream, "/stream", **headers, **upgrade)
-    assert status == 403 and not stream._server.clients
-    assert "stream.origins" in reported or "localhost only" in reported
+    for _ in range(2):
+        status, _, reported = answer(stream, "/stream", **headers, **upgrade)
+        assert status == 403 and not stream._server.clients and words in reported
+    named = "Host" not in headers  # else anybody may have called
+    assert [one.getMessage() for one in caplog.records] == [reported.strip()] * named
 
 
-def test_its_own_pages_and_those_that_are_named_may_listen() -> None:
-    with websocket_stream(origins=["http://localhost:3000"]) as stream:
+def test_its_own_pages_and_those_that_are_named_may_listen(capsys: pytest.CaptureFixture) -> None:
+    with websocket_stream(origins=["http://127.0.0.1:3000"]) as stream:
+        assert "from the first frame on" in capsys.readouterr().err
         own = f"http://{urlsplit(stream.url).netloc}"
-        for origin in (own, "http://localhost:3000"):
+        for origin in (own, "http://127.0.0.1:3000"):
             with listening(stream, Origin=origin) as one:
                 stream.send((hand_estimate(4),))
                 assert index_of(one) == 4

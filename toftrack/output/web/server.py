@@ -15,6 +15,7 @@ import ipaddress
 import json
 import logging
 import math
+import re
 import secrets
 import threading
 from collections import deque
@@ -55,6 +56,8 @@ _BACKLOG = 32
 _MOST_RECEIVED_BYTES = 4096
 """In a message of a client; who sends a longer one is cut off."""
 _REPORTED_EVERY_S = 60.0
+_MOST_ORIGINS = 20
+"""That the log tells of."""
 _CLOSING_S = 1.0
 """How long the messages that still wait at the end have to leave."""
 _PAUSE_S = 0.01
@@ -108,7 +111,8 @@ class WebServer:
     group: whose settings `host` and `port` (0 = any free one) are, for errors; "" where they are
     the options --host and --port.  pages: names of files in `package`, by the paths that they are
     served at.  path: where websockets are opened, each with a client by `new_client`.  origins: of
-    pages of other servers that may open one, as "http://localhost:3000".
+    pages of other servers that may open one, as "http://127.0.0.1:3000"; None where no setting of
+    the group names any.
 
     Raises ToftrackError: the port is taken or not allowed, or there is no such host here.
     """
@@ -122,9 +126,11 @@ class WebServer:
         pages: Mapping[str, str],
         path: str,
         new_client: Callable[[], Client],
-        origins: Collection[str] = (),
+        origins: Collection[str] | None = None,
     ) -> None:
-        self._host, self._path, self._origins = host, path, origins
+        self._group, self._host, self._path, self._origins = group, host, path, origins
+        self._refused: set[str] = set()
+        """Origins that the log has told of."""
         self._new_client = new_client
         folder = resources.files(package)
         self._pages = {
@@ -252,23 +258,39 @@ class WebServer:
         """The answer to a request; None lets a websocket be opened."""
         headers = request.headers
         if not self._is_called_by_name(headers.get("Host", "")):
-            return _text(403, "this server answers to its address and to localhost only")
+            named = f"; another name of it is {self._group}.host=NAME" if self._group else ""
+            return _text(403, f"this server answers to its address and to localhost only{named}")
         path = request.path.partition("?")[0]
         if path in self._pages:
             return _response(200, *self._pages[path])
         if path != self._path:
             return _text(404, f"there is no {path} here; pages are at {', '.join(self._pages)}")
         origin = headers.get("Origin")
-        if origin not in (None, f"http://{headers.get('Host')}", *self._origins):
-            return _text(
-                403,
-                "pages of other servers may not listen, but for those in stream.origins=[ORIGIN]",
-            )
+        allowed = (f"http://{headers.get('Host')}", *(self._origins or ()))
+        if origin is not None and origin not in allowed:
+            return _text(403, self._refusal(origin))
         if headers.get("Upgrade", "").lower() != "websocket":
             return _text(426, f"{path} is for websockets")
         if len(self.clients) >= MOST_CLIENTS:
             return _text(503, "too many clients listen already")
         return None
+
+    def _refusal(self, origin: str) -> str:
+        """What is said to a page of another server, and once to whoever runs this one."""
+        if not re.fullmatch(r"[\w-]+://[\w.:-]{1,100}", origin, re.ASCII):  # anybody writes it
+            origin = "no address"
+        if self._origins is None:
+            remedy = f"only {self.url} may"
+        elif origin == "no address":
+            remedy = "serve it from one, as a page that is opened as a file has no origin"
+        else:
+            given = ",".join((*self._origins, origin))
+            remedy = f"if it is yours, give '{self._group}.origins=[{given}]'"
+        words = f"a page of {origin} may not listen: {remedy}"
+        if origin not in self._refused and len(self._refused) < _MOST_ORIGINS:
+            self._refused.add(origin)
+            _log.warning("%s", words)
+        return words
 
     def _is_called_by_name(self, host_header: str) -> bool:
         """Whether a request calls this machine by an address, as localhost, or as `host`."""

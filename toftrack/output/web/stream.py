@@ -59,7 +59,8 @@ class WebSocketStream(Stream):
         """Of the first page, within the `with`."""
         print(
             f"the hand in 3-D: {self.url}, point and pinch: {self.url}point, for programs: "
-            f"ws{self.url[4:-1]}{STREAM}",
+            f"ws{self.url[4:-1]}{STREAM} (lines come from the first frame on, for which a first "
+            "run compiles for up to a minute)",
             file=sys.stderr,
             flush=True,
         )
