@@ -29,9 +29,9 @@ class ArrayOnDemand:
     """A field of a dataclass that may be given as a function without arguments: it is called when
     the field is first read. What few programs read then costs the others nothing."""
 
-    def __init__(self, *shape: int) -> None:
-        """shape: of the default, an array of NaN."""
-        self._shape, self._name = shape, ""
+    def __init__(self, *shape: int, kind: type = np.float64) -> None:
+        """shape, kind: of the default, an array of NaN."""
+        self._shape, self._kind, self._name = shape, kind, ""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
@@ -44,7 +44,7 @@ class ArrayOnDemand:
 
     def __get__(self, instance: object | None, owner: type) -> Any:
         if instance is None:  # the dataclass asks for the default
-            return lambda: np.full(self._shape, np.nan)
+            return lambda: np.full(self._shape, np.nan, self._kind)
         value = vars(instance)[self._name]
         if callable(value):
             value = vars(instance)[self._name] = value()
@@ -102,7 +102,7 @@ class Estimate:
     off, the hand is lost, or one of their last joints is not ok."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
-    joint_sigma_m: np.ndarray = field(default_factory=lambda: np.full((21, 3), np.nan, np.float32))
+    joint_sigma_m: ArrayOnDemand = ArrayOnDemand(21, 3, kind=np.float32)
     """(21, 3) float32 standard deviations of the joints along the camera's ray, along the finger
     and across both; see hand/regions.py. NaN where nothing says."""
     joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))

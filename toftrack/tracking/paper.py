@@ -174,7 +174,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     score = likelihood.score(pose)
     status = model.lost.judge(track, score)
     estimate = make_estimate(image, filtered, pose, score, status, fitted, model)
-    sigma_m = _joint_sigma(estimate.joints_m, filtered, model.encode(pose), fitted, model)
+    joints_m, particle = estimate.joints_m, model.encode(pose)
     hidden = bool(observation.occluder.any())
     track = changed(
         track,
@@ -186,9 +186,12 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
         believed_s=track.believed_s + dt_s if status.lost else 0.0,
         nearest_m=expected.nearest_m if expected and hidden else 0.0,
     )
-    ok = np.full(len(sigma_m), not status.lost)  # of its joints nothing more is known
+    ok = np.full(len(joints_m), not status.lost)  # of its joints nothing more is known
     estimate = estimate.updated(
-        joint_sigma_m=sigma_m, joint_ok=ok, side=slot.side, side_probability=sure
+        joint_sigma_m=lambda: _joint_sigma(joints_m, filtered, particle, fitted, model),
+        joint_ok=ok,
+        side=slot.side,
+        side_probability=sure,
     )
     slot, estimate = finish_estimate(slot, image, estimate, fitted.shape, dt_s, model)
     info = StepInfo(observation, filtered.particles, filtered.weights, spans.seconds())
