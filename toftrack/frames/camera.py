@@ -7,6 +7,7 @@ X = (u - cx) Z / fx and Y = (v - cy) Z / fy on the undistorted image.
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
@@ -25,6 +26,8 @@ _VERSION = 1
 _COUNTS = (4, 5, 8, 12, 14)
 """How many coefficients OpenCV's lens model may have."""
 _LENSES = ("opencv", "fisheye")
+_INFINITY = np.uint32(0x7F80_0000)
+"""A float32's, read as a whole number."""
 # The iteration that undoes a lens: enough for the strong ones, and exact far below a pixel.
 _UNTIL = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-9)
 _SHORTEST, _LONGEST = 0.1, 50.0
@@ -73,6 +76,15 @@ def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
 
 
 # Compared by identity: the fields are arrays, and the tables below are cached per object.
+def largest_reading(depth: np.ndarray) -> float:
+    """The largest of float32 readings (H, W); inf where one is negative, infinite or no number.
+
+    In one pass: as whole numbers, these lie above all others, which are ordered as they are.
+    """
+    bits = depth.view(np.uint32).max()
+    return float(bits.view(np.float32)) if bits < _INFINITY else math.inf
+
+
 @fields_in_help
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -191,20 +203,19 @@ class Camera:
         Returns a new (H, W) float32, metres. Raises ToftrackError: it is not of the camera's size.
         """
         self._check_size(depth)
-        # A large image takes as long as memory does: nearly all are clean, and what follows is done
-        # in place.
-        if depth.min() >= 0 and depth.max() < np.inf:  # also false for NaN
-            z = np.array(depth, np.float32)
-        else:
-            z = np.where((depth > 0) & (depth < np.inf), depth, 0).astype(np.float32, copy=False)
+        # A large image takes as long as memory does: nearly all are clean, and as few passes as
+        # possible are made over them.
+        z = measured = np.ascontiguousarray(depth, np.float32)
+        if largest_reading(z) == np.inf:
+            z = np.where((z > 0) & (z < np.inf), z, np.float32(0))
         if self.depth_polynomial:
-            if not radial:
-                z *= self._ray_lengths
-            z = self._corrected(z)
+            z = self._corrected(z if radial else z * self._ray_lengths)
             z /= self._ray_lengths
         elif radial:
-            z /= self._ray_lengths
-        return self._undistort(z) if self._distorted else z
+            z = z / self._ray_lengths
+        if self._distorted:
+            return self._undistort(z)
+        return z.copy() if z is measured else z
 
     def undistort_amplitude(self, amplitude: np.ndarray | None) -> np.ndarray | None:
         """The (H, W) amplitude image on the grid of `rectify`, of the same type; None stays None.

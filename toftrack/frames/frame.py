@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.errors import ToftrackError
-from toftrack.frames.camera import Camera
+from toftrack.frames.camera import Camera, largest_reading
 from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
@@ -161,10 +161,10 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     depth = np.ascontiguousarray(depth, np.float32)
-    farthest = depth.max()
-    if not (depth.min() >= 0 and farthest < np.inf):  # also true for NaN
+    farthest = largest_reading(depth)
+    if farthest == np.inf:
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
-        farthest = depth.max()
+        farthest = largest_reading(depth)
     if farthest > LARGEST_MEDIAN_M and median_reading(depth) > LARGEST_MEDIAN_M:
         raise wrong_unit("the depth image", depth)
     return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

@@ -132,7 +132,7 @@ class Scene:
     def segment(self, expected: Expected, row: int) -> Observation:
         """The observation of the hand of a row, -1 = of a new one, where it is expected."""
         others = self.owned_by_others(row)
-        return self.model.segmentation(self.image.depth_m, self.image.k, expected, others)
+        return self.model.segmentation(self.depth_m, self.k, expected, others)
 
     def others_joints(self, row: int) -> tuple[torch.Tensor, ...]:
         """The joints (21, 3) m of each reliable hand but the row's."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 
 from toftrack.compute.compiling import entry_point
@@ -39,17 +38,21 @@ _EXCHANGES = _exchanges(_SIDE * _SIDE)
 
 @entry_point
 def _thinned(image, factor, offset, exchanges, out):
-    """See `thinned`; the image has a border of half a window. A row at a time, so that the
-    exchanges are vectorised over its columns.
-    """
-    columns = out.shape[1]
+    """See `thinned`. A row at a time, so that the exchanges are vectorised over its columns."""
+    columns, half = out.shape[1], _SIDE // 2
     values = np.empty((_SIDE * _SIDE, columns), np.float32)
+    where = np.empty((_SIDE, columns), np.uint64)
+    for place in range(_SIDE):
+        for column in range(columns):
+            at = column * factor + offset + place - half
+            where[place, column] = min(max(at, 0), image.shape[1] - 1)
     for row in range(len(out)):
         for place in range(_SIDE * _SIDE):
-            line = values[place]
-            source = image[row * factor + offset + place // _SIDE, offset + place % _SIDE :]
+            at = row * factor + offset + place // _SIDE - half
+            source = image[min(max(at, 0), len(image) - 1)]
+            line, read = values[place], where[place % _SIDE]
             for column in range(columns):
-                line[column] = source[np.uint64(column) * np.uint64(factor)]
+                line[column] = source[read[column]]
         for pair in range(len(exchanges)):
             low, high = values[exchanges[pair, 0]], values[exchanges[pair, 1]]
             for column in range(columns):
@@ -68,7 +71,6 @@ def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
     thread, for meanwhile the networks have the others.
     """
     rows, columns = (len(range(offset, size, factor)) for size in image.shape)
-    out, half = np.empty((rows, columns), np.float32), _SIDE // 2
-    bordered = cv2.copyMakeBorder(image, half, half, half, half, cv2.BORDER_REPLICATE)
-    _thinned(bordered, factor, offset, _EXCHANGES, out)
+    out = np.empty((rows, columns), np.float32)
+    _thinned(image, factor, offset, _EXCHANGES, out)
     return out
