@@ -31,13 +31,10 @@ _IN_FRONT_M = 0.03
 class Scene:
     """An image, and the hands predicted in it.
 
-    depth_m, k: (H, W) and (3, 3), the image reduced to the pixels that hands are segmented in.
     hands: one a track; a row is an index into them.  dt_s: since the last frame.
     """
 
     image: DepthImage
-    depth_m: np.ndarray
-    k: np.ndarray
     hands: tuple[PredictedHand, ...]
     dt_s: float
     model: TrackerModel
@@ -47,9 +44,22 @@ class Scene:
         cls, tracks: Sequence[Track], image: DepthImage, dt_s: float, model: TrackerModel
     ) -> Scene:
         """The scene of a frame that comes dt_s after the tracks' last one."""
-        depth_m, k = reduce_image(image.depth_m, image.k, model.segmentation.max_pixels)
-        hands = tuple(predict(track, dt_s, model) for track in tracks)
-        return cls(image, depth_m, k, hands, dt_s, model)
+        return cls(image, tuple(predict(track, dt_s, model) for track in tracks), dt_s, model)
+
+    @cached_property
+    def _reduced(self) -> tuple[np.ndarray, np.ndarray]:
+        """Made when it is asked for: of a large image meanwhile the networks look."""
+        return reduce_image(self.image.depth_m, self.image.k, self.model.segmentation.max_pixels)
+
+    @property
+    def depth_m(self) -> np.ndarray:
+        """(H, W) m, the image reduced to the pixels that hands are segmented in."""
+        return self._reduced[0]
+
+    @property
+    def k(self) -> np.ndarray:
+        """(3, 3) of that."""
+        return self._reduced[1]
 
     @cached_property
     def _surfaces(self) -> np.ndarray:
