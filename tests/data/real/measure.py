@@ -8,6 +8,8 @@ and silently wrong frames, without the first two joints, which mean other places
 that are not lost, those with all visible tips within 40 mm, and those with one that is farther off
 and ok. A tip is visible where nothing is seen more than 25 mm before it. Of single images, each
 shown to a new tracker for ten frames: what each is called. Of others: how many frames are lost.
+Where the recording's folder has labels.json, visible fingertips that were labelled by eye, also
+what `toftrack benchmark accuracy --labels` tells of them.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.api import make_hands_tracker
+from toftrack.evaluation.image_labels import Points, point_rows, read_labels
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, trust
 from toftrack.frames.frame import Truth
 from toftrack.training.fit_confidence import reliability_figure
@@ -57,10 +60,11 @@ def main() -> None:
             sure.append(said)
             right.append(near)
         elif "labels" in kept or len(kept["depth_m"]) < _SEVERAL:
-            rows[path.stem] = _images(kept, settings)
+            rows[path.stem] = _images(path.stem, kept, settings)
         else:
             said = _tracked(kept, settings)
             rows[path.stem] = {"frames": len(said), "flagged": sum(one.lost for one in said)}
+            rows[path.stem] |= _labelled(path.stem, kept, said)
         print(f"{path.stem}:", json.dumps(rows[path.stem]))
     if sure:
         reliability = np.concatenate(sure), np.concatenate(right)
@@ -121,15 +125,33 @@ def _visible(points_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.nda
     return visible
 
 
-def _images(kept: dict[str, np.ndarray], settings: list[str]) -> dict[str, Any]:
+def _labelled(name: str, kept: dict[str, np.ndarray], said: list[Any]) -> dict[str, float]:
+    """What is told of the labels of a recording or of single images; nothing where it has none."""
+    file = Path(__file__).parent / name / "labels.json"
+    if not file.exists():
+        return {}
+    labels = read_labels(file)
+    assert isinstance(labels, Points)
+    fields = ("joints_m", "lost", "joint_ok")
+    columns = [np.array([getattr(one, field) for one in said]) for field in fields]
+    rows = list(point_rows(labels, *columns, kept["K"].astype(float)).values())
+    names = [name for name in rows[0] if isinstance(rows[0][name], (int, float))]
+    return {"labelled": len(rows)} | {
+        name: round(float(np.mean([row[name] for row in rows])), 2) for name in names
+    }
+
+
+def _images(name: str, kept: dict[str, np.ndarray], settings: list[str]) -> dict[str, Any]:
     called, settings = [], [*settings, "hand.side=auto"]  # nobody says whose hand each shows
+    said = []
     for number, image in enumerate(kept["depth_m"]):
         tracker = make_hands_tracker(*settings)
         for index in range(_SHOWN_FRAMES):
             one = tracker.step(image, kept["K"].astype(float), index, index / 25)[0]
+        said.append(one)
         shown = str(kept["labels"][number]) if "labels" in kept else "-"
         called.append(f"{shown}: {'lost' if one.lost else one.gesture or '-'}")
-    return {"images": len(called), "called": called}
+    return {"images": len(called), "called": called} | _labelled(name, kept, said)
 
 
 def _print_reliability(said: np.ndarray, right: np.ndarray) -> None:
