@@ -4,8 +4,8 @@
     python tests/data/real/make_extract.py RECORDING GIT_DIR OUT.npz
 
 RECORDING: adi_tof, camcube_counts, camcube_group1, camcube_group3, cvar_p1, cvar_p3, cvar_p4,
-cvar_p5, cvar_p6, cvar_p7, fpha, hamer_depth, kinect1_room or r200_ceiling. Needs git, numpy and
-opencv, r200_ceiling also scipy.
+cvar_p5, cvar_p6, cvar_p7, fpha, hamer_depth, kinect1_room, r200_ceiling, room_phone, room_table or
+room_workshop. Needs git, numpy and opencv, r200_ceiling also scipy.
 """
 
 import io
@@ -168,6 +168,22 @@ def r200_ceiling():
     save(depth, intrinsics(615.0, 615.0, 319.5, 239.5), joints_uv=joints, labels=labels)
 
 
+def room(folder, K, fps):
+    """Depth images without any hand: 16 bit, millimetres, FOLDER/NUMBER.png."""
+    command = ["git", "-C", git_dir, "ls-tree", "-r", "--name-only", "HEAD", f"{folder}/"]
+    names = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split()
+    paths = sorted((n for n in names if n.endswith(".png")), key=lambda n: (len(n), n))
+    depth = np.stack([image.astype(np.float32) / 1000 for image in images(*paths)])
+    depth[depth > 10] = 0
+    save(depth, K, fps)
+
+
+ROOMS = {
+    # K is that of the repository; none of the other two is told: what such cameras usually have.
+    "table": ("data/depth", intrinsics(616.7, 616.9, 324.8, 238.0), 1.0),
+    "workshop": ("data/depth", intrinsics(385.0, 385.0, 319.5, 239.5), 30.0),
+    "phone": ("depth", intrinsics(213.0, 213.0, 96.0, 128.0), 1.0),
+}
 CAMCUBE = {
     "counts": ("data", "palm fist thumb_up victory three four palm"),
     "group1": (
@@ -186,6 +202,7 @@ MAKERS |= {f"cvar_p{n}": lambda n=n: cvar(f"P{n}") for n in (1, 3, 4, 5, 6, 7)}
 MAKERS |= {
     f"camcube_{name}": lambda given=given: camcube(*given) for name, given in CAMCUBE.items()
 }
+MAKERS |= {f"room_{name}": lambda given=given: room(*given) for name, given in ROOMS.items()}
 
 if recording not in MAKERS:
     raise SystemExit(__doc__)
