@@ -41,6 +41,7 @@ from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.recordings.recorder import Recorder
 from toftrack.render.likelihood import FMeasure
+from toftrack.tracking.paper import PaperModel
 from toftrack.tracking.tracker import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
@@ -151,8 +152,8 @@ class Run:
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
         model = self.tracker.model
-        if hasattr(model.lost, "score") and not isinstance(model.likelihood, FMeasure):
-            advice = advice[:1]  # the hand may well have been seen, and its threshold be of another
+        if isinstance(model, PaperModel) and not isinstance(model.likelihood, FMeasure):
+            advice = advice[:1]  # rather than the hand, lost.score is wrong, which is said
         if advice[1:] and (doubts := self.device.description.get("doubts")):
             # What there is to try may contradict it: hold nearer what is of another unit.
             advised = (f"If that is as it should be: {more}" for more in advice[1:])
