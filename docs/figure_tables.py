@@ -141,9 +141,9 @@ def _sets(rows: Rows) -> list[str]:
         ("partly %", "partly_pct", 1),
         ("silent %", "silent_pct", 1),
         ("false alarms %", "false_alarm_pct", 1),
-        ("mean mm", "mean_all_mm", 1),
+        ("mean all mm", "mean_all_mm", 1),
         ("usable: joints mm", "usable_mean_mm", 1),
-        ("tips mm", "usable_tip_mm", 1),
+        ("usable: tips mm", "usable_tip_mm", 1),
     )
     lines = [
         "| recordings | method | " + " | ".join(title for title, _, _ in keys) + " | commit |",

@@ -13,8 +13,8 @@ of estimate minus truth.
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -66,8 +66,12 @@ def cell(error: np.ndarray) -> str:
 
 
 def main() -> None:
-    paths = [file for folder in sys.argv[1:] for file in sorted(Path(folder).glob("*.npz"))]
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path, metavar="FOLDER")
+    paths = [file for at in parser.parse_args().folders for file in sorted(at.glob("*.npz"))]
     parts = [part for part in map(measured, paths) if part is not None]
+    if not parts:
+        raise SystemExit("error: no .npz there has joints_m and metadata; give folders with truth")
     error, true_deg, ok, sure = (np.concatenate(pieces) for pieces in zip(*parts, strict=True))
     print(f"{len(parts)} recordings, {len(error)} frames; {100 * ok.mean():.0f} % of the angles")
     print(f"are ok, {100 * sure.mean():.0f} % of all have a confidence of 0.95\n")

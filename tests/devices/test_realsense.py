@@ -265,8 +265,13 @@ def test_senseless_settings_are_reported(changes: dict[str, Any], reported: str)
         realsense(**changes)
 
 
-def test_a_missing_or_old_sdk_is_reported_with_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_or_old_sdk_is_reported_with_the_extra(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
     for module in (None, ModuleType("pyrealsense2")):
         monkeypatch.setitem(sys.modules, "pyrealsense2", module)
         with pytest.raises(ToftrackError, match=r"pyrealsense2.*pip install -e '.\[realsense\]'"):
             realsense()
+        with pytest.raises(ToftrackError, match="ROS topics goes without: toftrack track FILE"):
+            realsense(bag=tmp_path / "a.bag")

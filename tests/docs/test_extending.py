@@ -277,6 +277,7 @@ def test_a_likelihood_tracks_as_the_page_says_and_else_hears_of_its_threshold(
         json.loads((tmp_path / "out" / "summary.json").read_text())["lost_frames"] == 0
     )
     assert given == (re.search(r"the mean score is 0\.3\d, and below lost.score=0.5", err) is None)
+    assert "overlay.png" not in err and ("5 of 5 frames were lost" in err) != given
 
 
 PAPER = ("experiment=paper", "gestures=none", "hand.side=right")

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from helpers.hands import hand_estimate
 from helpers.tracking import ROOT
 
 import toftrack
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
+from toftrack.output.results import ResultWriter
 
 sys.path.insert(0, str(ROOT / "docs"))
-from measure_angles import bent_deg, every_neighbour
+from measure_angles import bent_deg, every_neighbour, main
 
 
 def joints(**angles_rad: float) -> np.ndarray:
@@ -36,6 +40,43 @@ def test_an_angle_is_ok_where_its_three_joints_are() -> None:
     ok = np.ones((1, 21), bool)
     ok[0, toftrack.JOINT_NAMES.index("index_dip")] = False
     assert np.argwhere(~every_neighbour(ok)[0]).tolist() == [[1, 1], [1, 2]]
+
+
+def test_the_table_of_degrees_says_which_are_ok(tmp_path: Path) -> None:
+    pytest.importorskip("pandas", reason="pip install '.[pandas]'")
+    dice = np.random.default_rng(0)
+    with ResultWriter(tmp_path, {}, toftrack.JOINT_NAMES) as writer:
+        for index in range(30):
+            writer.append((hand_estimate(index, bent=0.5, joint_ok=dice.random(21) < 0.8),))
+    results = toftrack.Results(toftrack.read_results(tmp_path / "track.npz"))
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"<!-- test: degrees -->\n```python\n(.*?)```", text, re.DOTALL)
+    known = {"np": np, "toftrack": toftrack, "results": results}
+    exec(code.replace('toftrack.track("hand.npz").results()', "results"), known)
+    table, ok = known["table"], every_neighbour(results.joint_ok)
+    for name in toftrack.ANGLE_NAMES:
+        finger, joint = divmod(toftrack.JOINT_NAMES.index(name.rpartition("_")[0]) - 1, 4)
+        assert table[f"{name}_ok"].tolist() == ok[:, finger, joint].tolist(), name
+    pip = results.state[:, 6 + toftrack.ANGLE_NAMES.index("ring_pip_flexion")]
+    assert table.ring_pip_flexion_deg.to_numpy() == pytest.approx(np.degrees(pip))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [(["--help"], "usage: "), (["."], "no .npz there has joints_m"), ([], "FOLDER")],
+)
+def test_without_truth_a_sentence_says_so(
+    words: list[str],
+    said: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["measure_angles.py", *words])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert said in f"{capsys.readouterr()}{end.value}"
 
 
 @pytest.mark.parametrize(

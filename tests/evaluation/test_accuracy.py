@@ -101,11 +101,13 @@ def test_labelled_images_are_measured_too(folder, tmp_path, capsys) -> None:
     assert result["total"] is None and "named rightly %" in capsys.readouterr().out
 
 
-def test_one_recording_has_no_interval() -> None:
+def test_one_recording_has_no_interval_and_few_have_no_star() -> None:
     of = {"here": 2.0, "there": 1.0, "mean": 1.0, "low": 1.0, "high": 1.0}
-    rows = results.difference_table({"a": of | {"recordings": 1}, "b": of | {"recordings": 2}})[1:]
+    rows = results.difference_table(
+        {"a": of | {"recordings": 1}, "b": of | {"recordings": 4}, "c": of | {"recordings": 5}}
+    )[1:]
     ends = [row[4:] for row in rows]
-    assert ends == [["-", "1", ""], ["+1.00 to +1.00", "2", "*"]]
+    assert ends == [["-", "1", ""], ["+1.00 to +1.00", "4", ""], ["+1.00 to +1.00", "5", "*"]]
 
 
 def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> None:

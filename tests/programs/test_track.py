@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import pickle
+import re
 import shutil
 import signal
 import subprocess
@@ -128,6 +129,15 @@ def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
     notes = [line for line in err.splitlines() if line.startswith("note: ")]
     assert notes[1].startswith("note: First see to what was doubted: nearly all readings are")
     assert all(note.startswith("note: If that is as it should be: ") for note in notes[2:])
+
+
+def test_what_is_logged_meanwhile_stands_on_a_line_of_its_own(here, tmp_path: Path) -> None:
+    kept = ("record=kept.npz", "record_limit_gb=0.0004")
+    status, _, err = here("device.stop=12", "view=none", *kept, *QUICK)
+    assert status == 0 and re.search(
+        r"[\r\n]the recording 'kept.npz' ends after \d frames.*\n", err
+    )
+    assert "the recording 'kept.npz' ends" in (tmp_path / "out" / "track.log").read_text()
 
 
 def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:

@@ -16,7 +16,13 @@ from toftrack.frames.camera import Camera
 from toftrack.frames.frame import checked_image
 from toftrack.output.advice import Watch
 from toftrack.output.summary import apparent_doubt, length_doubt
-from toftrack.recordings.doubts import centre_doubt, lens_doubt, names_doubt, times_doubt
+from toftrack.recordings.doubts import (
+    centre_doubt,
+    gaps_doubt,
+    lens_doubt,
+    names_doubt,
+    times_doubt,
+)
 from toftrack.recordings.npz import read_recording
 
 K = np.array([[200.0, 0, 88], [0, 200, 72], [0, 0, 1]])
@@ -50,6 +56,13 @@ def test_times_that_stand_still_are_reported() -> None:
 )
 def test_times_of_cameras_are_not_doubted(times: np.ndarray) -> None:
     assert times_doubt(np.asarray(times)) == ""
+
+
+def test_gaps_in_time_are_counted_with_the_first() -> None:
+    words = "1 of 5 steps in time are longer than 1.5 times the usual 0.033 s, the first, of 0.367"
+    assert words in gaps_doubt(TIMES) and "s, after frame 4;" in gaps_doubt(TIMES)
+    for whole in (TIMES[:5], TIMES[:1], np.zeros(4)):
+        assert gaps_doubt(whole) == ""
 
 
 @pytest.mark.parametrize(
@@ -95,9 +108,13 @@ def test_the_centre_of_another_resolution_is_reported(centre: tuple, words: str)
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        ("depth_{:04}.png 1 2 3 7 8 10", "leave out 4, the first between 'depth_0003.png' and"),
-        ("{}.png 0 2 3", "leave out 1, the first between '0.png' and '2.png'"),
-        ("s2/depth_{}_v1.png 10 20 50", "leave out 2"),
+        ("depth_{:04}.png 1 2 3 7 8 10", "names leave out 4 (4-6, 9), but"),
+        ("{}.png 0 2 3", "leave out 1 (1), but"),
+        ("s2/depth_{}_v1.png 10 20 50", "leave out 2 (30-40), but"),
+        (
+            f"{{}}.png 0 1 {' '.join(map(str, range(3, 27, 2)))}",
+            "(2, 4, 6, 8, 10, 12, 14, 16, 18, 20, ...)",
+        ),
         ("depth_{:04}.png 3 4 5", ""),
         ("{}.png 0 5 10 15", ""),  # every fifth was kept
         ("{}.png 1700000033 1700000066 1700000100 1700000133", ""),  # milliseconds
@@ -118,8 +135,8 @@ def test_a_folder_with_missing_numbers_is_doubted_until_it_has_times(tmp_path: P
             cv2.imwrite(str(tmp_path / f"depth_{number}.png"), image)
     folder = Folder(tmp_path, intrinsics=[200, 200, 88, 72])
     assert folder.description["files"] == ["depth_1.png", "depth_2.png", "depth_5.png"]
-    assert "between 'depth_2.png' and 'depth_5.png'" in folder.description["doubts"][0]
-    (tmp_path / "timestamps.txt").write_text("0.04\n0.08\n0.2\n")
+    assert "leave out 2 (3-4)" in folder.description["doubts"][0]
+    (tmp_path / "timestamps.txt").write_text("0.04\n0.08\n0.12\n")
     assert Folder(tmp_path, intrinsics=[200, 200, 88, 72]).description["doubts"] == []
 
 

@@ -6,7 +6,8 @@ toftrack/evaluation/trust.py, measures.py and rows.py say what each figure is. W
 that were labelled by eye are measured, too (toftrack/evaluation/image_labels.py).
 
 --compare FILE takes the difference to an earlier measurement, paired by recording and seed: the
-gate for a change of the tracker. A * marks intervals that do not hold 0.
+gate for a change of the tracker. A * marks intervals that do not hold 0, of five recordings and
+more.
 
 --peer mediapipe measures MediaPipe Hands on the amplitude images, lifted to metres by the depth
 (peer_mediapipe.py says how), with the same measures, and times it in turn with the tracker.
@@ -32,7 +33,7 @@ ABLATION = """What each part of the tracker brings: `toftrack benchmark ablation
 
 Tracks recordings with truth as the default does, and again with one part changed or left out, with
 the same seeds; differences are paired by recording and seed, with 90 % intervals over recordings.
-A * marks intervals that do not hold 0.
+A * marks intervals that do not hold 0, of five recordings and more.
 """
 
 
@@ -155,13 +156,14 @@ def _report(
         result["peer"] = about["peer"] | results.result_of(unnamed)
         for title, table in results.accuracy_tables(result["peer"]).items():
             tables[f"{title}: {PEER}"] = [[PEER, *table[0][1:]], *table[1:]]
-    print("\n\n".join([*map(results.plain, tables.values()), *notes]))
     if options.json:
         results.write_text(options.json, results.json_text(result))
     if options.markdown:
         parts = [f"`{about['command']}`, commit {about['commit'] or 'unknown'}"]
         parts += [f"## {title}\n\n{results.markdown(table)}" for title, table in tables.items()]
         results.write_text(options.markdown, "\n\n".join([*parts, *notes]) + "\n")
+    # After the files, which a reader that goes away must not cost.
+    print("\n\n".join([*map(results.plain, tables.values()), *notes]))
     if options.picture:
         draw(options.picture, result)
 

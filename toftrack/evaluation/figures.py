@@ -10,14 +10,13 @@ from typing import NamedTuple
 
 
 class Figure(NamedTuple):
-    """A figure.  heading, digits: of its column.
+    """A figure.  key: in files, and in comparisons.  heading, digits: of its column.
 
     over: how a total comes from recordings. "mean": their mean, with an interval; "image mean": the
     same of labelled images; "count", "sum", "largest": of all; "median": of all rows; "pooled":
     over all that is counted in all rows.
     shown: in which tables. "each": of recordings; "images": of labelled images; "groups";
     "ablation"; "history": kept in docs/figures.json and docs/lab/history.md.
-    alone: the heading of groups and ablation, where the column before does not stand.
     """
 
     key: str
@@ -25,7 +24,6 @@ class Figure(NamedTuple):
     digits: int
     over: str
     shown: str
-    alone: str = ""
 
 
 FIGURES = (
@@ -44,10 +42,10 @@ FIGURES = (
     Figure("false_alarm_pct", "false alarms %", 1, "mean", "each groups ablation history"),
     Figure("never_right", "never right", 1, "sum", "each history"),
     Figure("first_right", "first right", 0, "median", "each history"),
-    Figure("mean_all_mm", "mean mm", 1, "mean", "each ablation history"),
-    Figure("mean_mm", "unflagged", 1, "mean", "each groups history", "unflagged mm"),
-    Figure("usable_mean_mm", "usable mm", 1, "mean", "each history"),
-    Figure("usable_tip_mm", "tips mm", 1, "mean", "each ablation history", "usable tips mm"),
+    Figure("mean_all_mm", "mean all mm", 1, "mean", "each ablation history"),
+    Figure("mean_mm", "mean mm", 1, "mean", "each groups history"),
+    Figure("usable_mean_mm", "usable mean mm", 1, "mean", "each history"),
+    Figure("usable_tip_mm", "usable tip mm", 1, "mean", "each ablation history"),
     Figure("tip_mm", "", 1, "mean", ""),
     Figure("swap_pct", "swaps %", 1, "mean", "each ablation history"),
     Figure("jitter_mm", "jitter mm", 2, "mean", "each ablation history"),
@@ -81,12 +79,7 @@ def keys_over(over: str) -> tuple[str, ...]:
 
 def columns(table: str) -> Columns:
     """A table's columns: heading, key, digits."""
-    short = table in ("each", "images")
-    return tuple(
-        (f.heading if short else f.alone or f.heading, f.key, f.digits)
-        for f in FIGURES
-        if table in f.shown.split()
-    )
+    return tuple((f.heading, f.key, f.digits) for f in FIGURES if table in f.shown.split())
 
 
 def kept_keys(table: str) -> tuple[str, ...]:

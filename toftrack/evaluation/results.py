@@ -32,6 +32,8 @@ from toftrack.files.safe_files import write_whole
 FORMAT = "toftrack accuracy 1"
 Table = list[list[str]]
 """Rows of cells, the heads first; the first column is text."""
+_FEWEST_FOR_A_STAR = 5
+"""Recordings; fewer, drawn again, are too much alike for an interval to be believed."""
 
 
 def circumstances() -> dict[str, Any]:
@@ -217,8 +219,9 @@ def difference_table(differences: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def clear_mark(of: Mapping[str, Any]) -> str:
-    """A star for a difference whose interval, over several recordings, does not hold 0."""
-    return "*" if of["recordings"] > 1 and (of["low"] > 0 or of["high"] < 0) else ""
+    """A star for a difference whose interval, over enough recordings, does not hold 0."""
+    enough = of["recordings"] >= _FEWEST_FOR_A_STAR
+    return "*" if enough and (of["low"] > 0 or of["high"] < 0) else ""
 
 
 def plain(table: Table) -> str:

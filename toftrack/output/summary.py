@@ -266,9 +266,13 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
         text_of(trust[name] if seen else None) for name in ("usable_pct", "false_alarm_pct")
     )
     right = "never" if first is None else f"in frame {first}"
+    partly = (
+        f"; in {text_of(trust['partly_pct'])} % some joints are over 40 mm off, their mean is not"
+    )
+    between = partly if trust["partly_pct"] > 0 else ""
     in_a_row = f", up to {longest} frames in a row" if longest else ""
     rows = [
-        ("usable", f"{usable} % of the {seen} visible frames"),
+        ("usable", f"{usable} % of the {seen} visible frames{between}"),
         ("silently wrong", f"{silent} %{in_a_row}"),
         ("false alarms", f"{alarms} %"),
         ("first right", right if seen else "-"),

@@ -55,9 +55,9 @@ def _speed(arguments: Sequence[str]) -> None:
         parser.error("--particles must be above 0")
     baselines = not given.no_baselines
     result = speed.run(given.particles, given.compute, given.seconds, given.frames, baselines)
-    print(speed.show(result))
     if given.json:
         write_whole(given.json, json.dumps(result, indent=1) + "\n")
+    print(speed.show(result))
 
 
 def _alternating(arguments: Sequence[str]) -> None:

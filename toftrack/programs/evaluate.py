@@ -36,9 +36,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     sequences = _chosen(sequences, options.sequences)
     inset_m = data_set.tip_inset_m if options.tip_inset is None else options.tip_inset / 1e3
     figures = evaluate(data_set, sequences, options.overrides, inset_m, options.frames)
-    print(table(figures))
-    print(f"compared: {', '.join(JOINT_NAMES[row] for row in data_set.joints)}")
-    print(f"tips: {data_set.tips}; ours are moved {1e3 * inset_m:g} mm inwards")
     if options.json:
         facts = {
             "data_set": data_set.name,
@@ -52,6 +49,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         }
         with reported_errors(f"'{options.json}' cannot be written", "choose another place"):
             write_whole(options.json, json.dumps(facts, indent=1, allow_nan=False) + "\n")
+    print(table(figures))
+    print(f"compared: {', '.join(JOINT_NAMES[row] for row in data_set.joints)}")
+    print(f"tips: {data_set.tips}; ours are moved {1e3 * inset_m:g} mm inwards")
 
 
 def _count(text: str) -> int:

@@ -21,6 +21,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
 from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
@@ -39,6 +40,8 @@ from toftrack.output.summary import metrics_line, metrics_table, shape_file
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words
 from toftrack.recordings.recorder import Recorder
+from toftrack.render.likelihood import FMeasure
+from toftrack.tracking.paper import PaperModel
 from toftrack.tracking.tracker import HandsTracker
 from toftrack.views.base import TrackedFrame, TrackedHand, View
 
@@ -148,6 +151,9 @@ class Run:
         dropped = tuple(filter(None, (self.realtime.words(),)))
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
+        model = self.tracker.model
+        if isinstance(model, PaperModel) and not isinstance(model.likelihood, FMeasure):
+            advice = advice[:1]  # rather than the hand, lost.score is wrong, which is said
         if advice[1:] and (doubts := self.device.description.get("doubts")):
             # What there is to try may contradict it: hold nearer what is of another unit.
             advised = (f"If that is as it should be: {more}" for more in advice[1:])
@@ -168,7 +174,7 @@ class Run:
         if in_sweep():  # gone afterwards, and none at all where nobody looks
             progress = partial(progress, leave=False, disable=None)
         try:
-            with progress() as bar:
+            with progress() as bar, logging_redirect_tqdm():  # above the bar, on lines of their own
                 for frame in self.device:
                     began_s = time.perf_counter()
                     with shutdown.not_now():

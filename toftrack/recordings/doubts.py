@@ -31,6 +31,10 @@ _TIME_UNITS = (
     ("thousands of seconds", 1e-3),
 )
 """Names of units and how many of them a second has, the likeliest first."""
+_LONG_STEP = 1.5
+"""Times the usual step between frames, beyond which some are missing."""
+_MOST_NAMED = 10
+"""Gaps between file names, of which each is named."""
 _OFF_MIDDLE = 0.3
 """Of the way from the image's middle to its border, beyond which a lens's centre is doubted."""
 _KEPT, _LEFT_BY_RIGHT_ONE = 0.7, 0.85
@@ -46,7 +50,8 @@ def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
     times = store.timestamp_s
     counted = np.array_equal(times, np.arange(len(store)) / store.fps)
     of_time = (counted and names_doubt(store.names)) or times_doubt(times)
-    found = (_images_doubt(store), centre_doubt(camera), of_time, lens_doubt(camera))
+    of_gaps = "" if of_time else gaps_doubt(times)
+    found = (_images_doubt(store), centre_doubt(camera), of_time, lens_doubt(camera), of_gaps)
     return tuple(filter(None, found))
 
 
@@ -117,6 +122,21 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
     return ""
 
 
+def gaps_doubt(timestamp_s: np.ndarray) -> str:
+    """What speaks against no frame being missing between times (T,); "" for nothing."""
+    steps = np.diff(timestamp_s)
+    usual = float(np.median(steps)) if steps.size else 0.0
+    gaps = np.flatnonzero(steps > _LONG_STEP * usual)
+    if usual <= 0 or not gaps.size:
+        return ""
+    first = gaps[0]
+    return (
+        f"frames are missing, or came late: {gaps.size} of {steps.size} steps in time are longer "
+        f"than {_LONG_STEP:g} times the usual {usual:.3g} s, the first, of {steps[first]:.3g} s, "
+        f"after frame {first}; a hand that moves fast is followed worse there"
+    )
+
+
 def names_doubt(names: Sequence[str]) -> str:
     """What speaks against files, in their order, being all frames there were; "" for nothing."""
     numbers = [re.findall(r"\d+", name) for name in names]
@@ -126,11 +146,14 @@ def names_doubt(names: Sequence[str]) -> str:
     # Steps of a clock, whose times may stand in names, too, are no multiples of the least one.
     if least < 1 or (steps % least).any() or (steps == least).all():
         return ""
-    first = int(np.argmax(steps > least))
+    rows = np.flatnonzero(steps > least)
+    ends = ((int(changing[0][row]) + least, int(changing[0][row + 1]) - least) for row in rows)
+    gaps = [f"{first}" if first == last else f"{first}-{last}" for first, last in ends]
+    more = ", ..." if len(gaps) > _MOST_NAMED else ""
     return (
-        f"the numbers in the files' names leave out {int((steps // least - 1).sum())}, the first "
-        f"between '{names[first]}' and '{names[first + 1]}', but the frames are timed as if none "
-        "were missing; write the seconds of each into timestamps.txt (docs/formats.md)"
+        f"the numbers in the files' names leave out {int((steps // least - 1).sum())} "
+        f"({', '.join(gaps[:_MOST_NAMED])}{more}), but the frames are timed as if none were "
+        "missing; write the seconds of each into timestamps.txt (docs/formats.md)"
     )
 
 

@@ -142,7 +142,7 @@ def rest(page: Any, aim: Callable[[], None]) -> None:
 
 CURSOR_PAGE = """
 document.body.innerHTML = "<div id=cursor></div>";
-cursor.style = "position: fixed; left: 0; top: 0; pointer-events: none";
+document.body.firstChild.style = "position: fixed; left: 0; top: 0; pointer-events: none";
 window.clicks = [];
 for (let k = 0; k < 10; k++) {
   const column = document.createElement("button");
@@ -160,7 +160,7 @@ def test_the_docs_cursor_follows_the_fingertip_and_a_pinch_clicks_where_it_was(
     (code,) = re.findall(r"<!-- test: cursor -->\n```js\n(.*?)```", text, re.DOTALL)
     page.get(f"{stream.url}feed.js")  # no page, but of this origin
     eventually(lambda: not stream._server.clients)
-    assert "ws://127.0.0.1:8766/" in code
+    assert "ws://127.0.0.1:8766/" in code and "u: [0.37, 0.76]" in code
     here = code.replace("ws://127.0.0.1:8766/", f"ws{stream.url.removeprefix('http')}")
     page.execute_script(CURSOR_PAGE + here)
     eventually(lambda: stream._server.clients)
@@ -168,14 +168,18 @@ def test_the_docs_cursor_follows_the_fingertip_and_a_pinch_clicks_where_it_was(
     frames = [(0.25, {})] * 10 + [(0.35, {})] * 5  # the fingers close
     frames += [(0.45, pinch), (0.45, pinch), (0.9, pinch | not_ok), (0.9, lost), (0.45, pinch)]
     frames += [(0.45, {})] * 8 + [(0.45, pinch)]
-    for index, (u, changes) in enumerate(frames):
-        landmarks = np.full((21, 3), (u, 0.5, 0.0))
+    # Nothing is known of 0.28 s before: no click, neither after a loss nor of what was before it.
+    frames += [(0.05, {})] * 8 + [(0.05, lost), *[(0.15, {})] * 3, (0.15, pinch)]
+    frames += [(0.45, {})] * 9 + [(0.45, pinch), (0.45, lost)]
+    for index, (at, changes) in enumerate(frames):
+        landmarks = np.full((21, 3), (0.37 + 0.39 * at, 0.755, 0.0))
         stream.send((hand_estimate(index, landmarks=landmarks, **changes),))
-    assert shown(page, "clicks.length > 1 && clicks", lambda: None) == [7, 5]
+    assert shown(page, "clicks.length > 2 && clicks", lambda: None) == [7, 5, 5]
     *there, wide, high = page.execute_script(
         "return [...cursor.style.translate.split(' ').map(parseFloat), innerWidth, innerHeight]"
     )
     assert there == pytest.approx([0.55 * wide, 0.5 * high], abs=0.1)
+    assert shown(page, "cursor.style.opacity === '0'", lambda: None)
 
 
 GAME = "point?seed=15411478&width=1&reach=0.5"

@@ -25,6 +25,7 @@ from toftrack.frames.frame import Frame
 _SUFFIXES = (".bag", ".db3")
 _SLICE_MS = 100  # of waiting, between looks at what else may have happened
 _WORST_FIT_PX = 0.5
+_ROS_TOPICS = "; a bag of ROS topics goes without: toftrack track FILE"
 
 
 class RealSense(SdkCamera):
@@ -70,7 +71,7 @@ class RealSense(SdkCamera):
                 f"{' or '.join(_SUFFIXES)}; replay other recordings with device=replay "
                 "device.path=FILE"
             )
-        rs = self._rs = load_sdk()
+        rs = self._rs = load_sdk(_ROS_TOPICS if bag is not None else "")
         self._emulator: EmulatedCamera | None = None
         size: Size = (None, None, None)
         if self._path is not None:
@@ -186,8 +187,11 @@ class RealSense(SdkCamera):
         )
 
 
-def load_sdk() -> ModuleType:
-    """The module pyrealsense2; ToftrackError when it is not installed or cannot be loaded."""
+def load_sdk(otherwise: str = "") -> ModuleType:
+    """The module pyrealsense2; ToftrackError when it is not installed or cannot be loaded.
+
+    otherwise: what else there is to do, for the error.
+    """
     try:
         return _imported()
     except ImportError as error:
@@ -201,6 +205,7 @@ def load_sdk() -> ModuleType:
             ) from error
         raise ToftrackError(
             f"device=realsense needs pyrealsense2 ({error}): pip install -e '.[realsense]'"
+            f"{otherwise}"
         ) from error
 
 
