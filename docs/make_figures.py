@@ -78,7 +78,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--strangers", action="store_true", help="track the public test set")
     what.add_argument("--tables", action="store_true", help="measure nothing")
     what.add_argument("--in-turn", type=Path, metavar="FILE", help="of benchmark alternating")
-    about = "at hand or away, and the JSON of tests/data/real/measure.py"
+    about = "at hand, away or rooms, and the JSON of tests/data/real/measure.py"
     what.add_argument("--real", metavar="NAME=FILE", help=about)
     parser.add_argument("--kinect2", type=Path, metavar="FILE", help="the real recording")
     parser.add_argument("--stills", type=Path, metavar="FILE", help="the real stills")
@@ -117,6 +117,14 @@ def _real(name: str, file: str) -> dict[str, Any]:
     found = json.loads(Path(file).read_text(encoding="utf-8"))
     true = [row for row in found.values() if "usable_pct" in row]
     row = _about(circumstances() | {"seeds": [0], "side": "told"})
+    if not true:  # rooms without a hand
+        lost = [
+            one.get("flagged", sum(shown.endswith(": lost") for shown in one.get("called", ())))
+            for one in found.values()
+        ]
+        row["frames"] = sum(one.get("frames", one.get("images")) for one in found.values())
+        row["called_pct"] = round(100 * (1 - sum(lost) / row["frames"]), 2)
+        return {name: row}
     row["frames"] = sum(one["frames"] for one in true)
     for key in ("usable_pct", "silent_pct", "tips_40_pct", "tips_wrong_ok_pct"):
         said = [one["frames"] - one["flagged"] * key.startswith("tips") for one in true]
