@@ -147,8 +147,9 @@ class FMeasure(Likelihood):
 
 def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
     """(N,) its scores; ToftrackError where they are none as `Likelihood.score` has them."""
-    found, some = torch.as_tensor(likelihood.score(counts)), counts.correct > 0
-    if found.shape == some.shape and bool(((found >= 0) & (found <= 1.0001 * some)).all()):
+    found, correct = torch.as_tensor(likelihood.score(counts)), counts.correct
+    pairs = zip(found.reshape(-1).tolist(), correct.tolist(), strict=False)
+    if found.shape == correct.shape and all(0 <= one <= 1.0001 * (n > 0) for one, n in pairs):
         return found
     raise ToftrackError(
         f"likelihood: {type(likelihood).__name__}.score gives {found.tolist()} where correct is"
