@@ -13,6 +13,7 @@ from toftrack.files.json_text import read_json, read_object
 from toftrack.files.safe_files import (
     check_replaceable,
     lock,
+    lock_folder,
     open_in_place,
     open_to_read,
     remove_partial,
@@ -98,9 +99,24 @@ def cut_unfinished_line(folder: Path) -> None:
         file.truncate(whole)
 
 
+def own_folder(folder: Path) -> int | None:
+    """`lock_folder` of a run's folder, which comes before anything is written there.
+
+    Raises ToftrackError where a run is writing into the folder, and OSError.
+    """
+    with _one_writer(folder):
+        return lock_folder(folder)
+
+
 def _lock(file: IO[bytes], folder: Path) -> None:
-    try:
+    with _one_writer(folder):
         lock(file)
+
+
+@contextmanager
+def _one_writer(folder: Path) -> Iterator[None]:
+    try:
+        yield
     except BlockingIOError:
         raise ToftrackError(
             f"another run is writing into the folder '{folder}' just now; wait for its end, or "
