@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -27,6 +28,16 @@ def test_help_begins_with_what_it_does_and_three_examples_and_loads_little(words
     assert all(line.startswith("  toftrack t") for line in examples)
     for slow in ("torch", "hydra", "numpy", "cv2"):
         assert f"| {slow}\n" not in done.stderr
+
+
+@pytest.mark.parametrize("words", [["--help"], ["track", "--help"], ["--version"]])
+def test_help_that_nobody_reads_is_no_traceback(words: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as pipe:
+        command = [sys.executable, "-m", "toftrack", *words]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_long_help_names_every_group_and_choice() -> None:

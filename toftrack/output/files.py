@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -57,6 +59,9 @@ class LineFile:
         """Write a line, given without its end."""
         data = memoryview((line + "\n").encode())
         begin = self._size
+        # Whoever removed it removes all that is written from now on.
+        if not os.fstat(self._file.fileno()).st_nlink and not self.path.exists():
+            raise FileNotFoundError(errno.ENOENT, f"its {LINES} was removed", str(self.path))
         try:
             while data:  # a disk that is nearly full takes a part
                 count = self._file.write(data)
