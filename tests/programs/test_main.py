@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from helpers.tracking import ROOT, configuration
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import toftrack
 from toftrack.errors import ToftrackError
@@ -137,6 +138,13 @@ def test_options_keep_their_values() -> None:
     assert options_first(words) == [
         *("--config-dir", "my", "--info=all", "--cfg", "job", "seed=1", "view=none")
     ]
+
+
+@pytest.mark.parametrize("name", ["Ünïcödé", "手 يد", "with blanks"])
+def test_a_folder_s_name_may_be_of_any_script(name: str) -> None:
+    (override,) = options_first([f"hydra.run.dir={name}/it"])
+    read = OverridesParser.create().parse_override(override)
+    assert (read.key_or_group, read.value()) == ("hydra.run.dir", f"{name}/it")
 
 
 @pytest.mark.parametrize("words", ["--version", "track seed=1 --version", "record --version"])

@@ -138,11 +138,19 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     value_follows = False
     for word in arguments:
         if not word.startswith("-") and not value_follows:
-            overrides.append(word)
+            overrides.append(_readable(word))
         else:  # the value of --info may be left out, and would be an override
             options.append("--info=all" if word in ("--info", "-i") else word)
         value_follows = not value_follows and word in _WITH_VALUE
     return [*options, *overrides]
+
+
+def _readable(override: str) -> str:
+    """Of letters outside of quotes Hydra reads those of ASCII alone, as in a folder's name."""
+    key, _, value = override.partition("=")
+    if value.isascii() or set(value) & set("""'"[]{}(),$"""):
+        return override
+    return f"{key}={quoted(value)}"
 
 
 def _is_file(argument: str, known: Collection[str]) -> bool:
