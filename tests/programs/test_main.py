@@ -140,6 +140,13 @@ def test_options_keep_their_values() -> None:
     ]
 
 
+@pytest.mark.parametrize("words", ["track --device sample", "track -o x", "recover", "export x"])
+def test_an_option_that_there_is_not_is_one_sentence(words: str, capsys) -> None:
+    assert front.main(words.split()) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and "--help" in said
+
+
 @pytest.mark.parametrize("name", ["Ünïcödé", "手 يد", "with blanks"])
 def test_a_folder_s_name_may_be_of_any_script(name: str) -> None:
     (override,) = options_first([f"hydra.run.dir={name}/it"])
@@ -175,6 +182,8 @@ def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missin
     [
         (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
         (["${x}.npz"], "rename the file"),
+        (["device", "=", "sample"], "'device' is no recording; .*without blanks as device=VALUE"),
+        (["view"], "'view' is no recording; .* view=VALUE"),
         (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
     ],
 )

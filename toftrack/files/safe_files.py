@@ -115,7 +115,8 @@ def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
 
 
 def lock(stream: IO[bytes] | RawIOBase | int) -> None:
-    """Have a file, or the folder of a descriptor, for oneself among those who ask, until it is closed; Windows grants it to all.
+    """Have a file, or the folder of a descriptor, for oneself among those who ask, until it is
+    closed; Windows grants it to all.
 
     Raises BlockingIOError while another process has it.
     """

@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -109,7 +109,14 @@ def run(main: Callable[[], object]) -> int:
 def plain_parser(program: str, about: str | None) -> argparse.ArgumentParser:
     """A parser whose help shows a text, of several lines, as it stands."""
     kind = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(prog=program, description=about, formatter_class=kind)
+    return Parser(prog=program, description=about, formatter_class=kind)
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, without all that there is."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ToftrackError(f"{message}; {self.prog} --help tells what there is")
 
 
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
