@@ -83,6 +83,24 @@ def test_its_own_error_is_reported_in_one_sentence(
     assert sentence(caught.value) == "'nowhere.raw' cannot be opened: No such file or directory"
 
 
+def test_a_camera_that_vanishes_is_named_and_what_came_before_is_kept(
+    workplace: Path, track: Callable
+) -> None:
+    code = (
+        (workplace / "my_device.py")
+        .read_text()
+        .replace(
+            "yield Frame(",
+            "if index == 2:\n                    raise OSError(19, 'No such device')\n"
+            "                yield Frame(",
+        )
+    )
+    (workplace / "my_device.py").write_text(code)
+    status, _, err = track("device.path=images.raw", "device.focal_px=200")
+    assert status == 1 and "error: No such device, in RawImages.__iter__ (" in err
+    assert "free what is needed" not in err and (workplace / "out" / "track.npz").exists()
+
+
 @pytest.mark.parametrize(
     ("code", "reason"),
     [

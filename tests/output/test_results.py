@@ -8,6 +8,7 @@ import errno
 import io
 import json
 import math
+import shutil
 import tracemalloc
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -300,6 +301,19 @@ def test_a_disk_that_fills_keeps_what_was_whole(tmp_path: Path) -> None:
             writer.append((estimate(3),))
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 3
     assert len(read_results(tmp_path / "track.npz")["lost"]) == 3
+
+
+def test_a_folder_that_is_removed_or_renamed_is_reported(tmp_path: Path) -> None:
+    """Removed, at the next frame: a live run has no end by itself."""
+    gone = "'.*/run' was removed or renamed.*recover.* the 1 frames"
+    with pytest.raises(ToftrackError, match=gone), ResultWriter(tmp_path / "run", {}, NAMES) as one:
+        one.append((estimate(0),))
+        shutil.rmtree(one.folder)
+        one.append((estimate(1),))
+    with pytest.raises(ToftrackError, match=gone), ResultWriter(tmp_path / "run", {}, NAMES) as one:
+        one.append((estimate(0),))
+        one.folder.rename(tmp_path / "now")
+    assert recover(tmp_path / "now")["frames"] == 1
 
 
 def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:

@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
+from toftrack.output.files import own_folder
 from toftrack.programs.command_line import FailedJobs, run
 
 pytestmark = pytest.mark.usefixtures("hangups_are_handled")
@@ -156,6 +157,20 @@ def test_a_failing_run_leaves_no_folder_but_keeps_one_with_files(app: Path) -> N
     assert (app / "mine" / "notes.txt").exists()
     assert call(app, "fail=late", "hydra.run.dir=late")[0] == 1
     assert (app / "late" / "summary.json").exists(), "what was written is kept"
+
+
+def test_a_folder_into_which_a_run_is_writing_stays_as_it_is(app: Path) -> None:
+    """Of two that begin at once into a new folder; the first one may not have written yet."""
+    with open(app / "conf" / "app.yaml", "a") as config:
+        config.write(CALLBACK)
+    shared = app / "deep" / "shared"
+    lock = own_folder(shared)
+    status, out, err = call(app, "hydra.run.dir=deep/shared")
+    assert (status, out) == (1, "") and err.startswith("error: another run is writing into")
+    assert err.count("\n") == 1 and not list(shared.iterdir())
+    os.close(lock)
+    assert call(app, "fail=clear", "hydra.run.dir=deep/shared")[0] == 1, "and nobody has it still"
+    assert call(app, "hydra.run.dir=deep/shared")[0] == 0 and (shared / ".hydra").exists()
 
 
 def test_full_errors_show_the_traceback_and_the_sentence(app: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from helpers.tracking import ROOT, configuration
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import toftrack
 from toftrack.errors import ToftrackError
@@ -27,6 +29,16 @@ def test_help_begins_with_what_it_does_and_three_examples_and_loads_little(words
     assert all(line.startswith("  toftrack t") for line in examples)
     for slow in ("torch", "hydra", "numpy", "cv2"):
         assert f"| {slow}\n" not in done.stderr
+
+
+@pytest.mark.parametrize("words", [["--help"], ["track", "--help"], ["--version"]])
+def test_help_that_nobody_reads_is_no_traceback(words: list[str]) -> None:
+    reading, writing = os.pipe()
+    os.close(reading)
+    with open(writing, "w") as pipe:
+        command = [sys.executable, "-m", "toftrack", *words]
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_long_help_names_every_group_and_choice() -> None:
@@ -128,6 +140,20 @@ def test_options_keep_their_values() -> None:
     ]
 
 
+@pytest.mark.parametrize("words", ["track --device sample", "track -o x", "recover", "export x"])
+def test_an_option_that_there_is_not_is_one_sentence(words: str, capsys) -> None:
+    assert front.main(words.split()) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("error: ") and said.count("\n") == 1 and "--help" in said
+
+
+@pytest.mark.parametrize("name", ["Ünïcödé", "手 يد", "with blanks"])
+def test_a_folder_s_name_may_be_of_any_script(name: str) -> None:
+    (override,) = options_first([f"hydra.run.dir={name}/it"])
+    read = OverridesParser.create().parse_override(override)
+    assert (read.key_or_group, read.value()) == ("hydra.run.dir", f"{name}/it")
+
+
 @pytest.mark.parametrize("words", ["--version", "track seed=1 --version", "record --version"])
 def test_the_version_is_ours(words: str, capsys) -> None:
     assert front.main(words.split()) == 0
@@ -156,6 +182,8 @@ def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missin
     [
         (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
         (["${x}.npz"], "rename the file"),
+        (["device", "=", "sample"], "'device' is no recording; .*without blanks as device=VALUE"),
+        (["view"], "'view' is no recording; .* view=VALUE"),
         (["a.npz", "device=sr3000"], "device=sr3000 and the recording 'a.npz'"),
     ],
 )

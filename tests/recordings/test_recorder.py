@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import re
+import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections import namedtuple
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -215,8 +217,8 @@ def test_before_the_disk_is_full_it_ends_as_a_whole_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     usage = namedtuple("usage", "free")(module._SPARE_BYTES + 6000)
-    shutil = SimpleNamespace(disk_usage=lambda path: usage)
-    monkeypatch.setattr("toftrack.recordings.unfinished.shutil", shutil)
+    fake = SimpleNamespace(disk_usage=lambda path: usage)
+    monkeypatch.setattr("toftrack.recordings.unfinished.shutil", fake)
     recorder = recorded(tmp_path / "hand.npz")
     assert 1 <= recorder.frames < FRAMES
     assert "the disk is nearly full" in (recorder.ended or "")
@@ -257,6 +259,25 @@ def test_what_cannot_be_finished_is_kept(tmp_path: Path, monkeypatch: pytest.Mon
     assert "which is kept (No space left on device); make room" in (recorder.ended or "")
     assert [file.name for file in tmp_path.iterdir()] == ["hand.npz.part"]
     assert recover_recording(tmp_path / "hand.npz")[1] == FRAMES
+
+
+@pytest.mark.parametrize(
+    ("go", "folder"), [(Path.unlink, "."), (lambda part: shutil.rmtree(part.parent), "deep")]
+)
+def test_what_is_removed_while_it_grows_is_one_sentence_and_nobody_waits(
+    tmp_path: Path, go: Callable[[Path], object], folder: str
+) -> None:
+    path = tmp_path / folder / "hand.npz"
+    path.parent.mkdir(exist_ok=True)
+    with Recorder(path, Images(), 1.0) as recorder:
+        recorder.put(one_frame(), wait=True)
+        while not recorder.frames:
+            time.sleep(0.001)
+        go(path.with_name("hand.npz.part"))
+        for _ in range(2 * module._WAITING):  # more than would wait
+            recorder.put(one_frame(), wait=True)
+    assert recorder.failed and not path.exists()
+    assert "was removed or renamed while the recording grew" in (recorder.ended or "")
 
 
 def test_times_never_go_back(tmp_path: Path) -> None:

@@ -114,8 +114,9 @@ def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
         raise
 
 
-def lock(stream: IO[bytes] | RawIOBase) -> None:
-    """Have a file for oneself among those who ask, until it is closed; Windows grants it to all.
+def lock(stream: IO[bytes] | RawIOBase | int) -> None:
+    """Have a file, or the folder of a descriptor, for oneself among those who ask, until it is
+    closed; Windows grants it to all.
 
     Raises BlockingIOError while another process has it.
     """
@@ -127,6 +128,29 @@ def lock(stream: IO[bytes] | RawIOBase) -> None:
         raise
     except OSError:
         pass  # some network file systems have no locks
+
+
+def lock_folder(path: str | Path) -> int | None:
+    """Make a folder where there is none, and have it for oneself until the descriptor is closed.
+
+    None on Windows, which locks no folders. Raises BlockingIOError while another process has it,
+    and OSError.
+    """
+    while True:
+        Path(path).mkdir(parents=True, exist_ok=True)
+        if fcntl is None:
+            return None
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            lock(descriptor)
+            if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                return descriptor
+        except FileNotFoundError:
+            pass  # whoever had it before took it away, and so what is locked is none any more
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
 
 
 @contextmanager

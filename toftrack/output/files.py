@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -13,6 +15,7 @@ from toftrack.files.json_text import read_json, read_object
 from toftrack.files.safe_files import (
     check_replaceable,
     lock,
+    lock_folder,
     open_in_place,
     open_to_read,
     remove_partial,
@@ -56,6 +59,9 @@ class LineFile:
         """Write a line, given without its end."""
         data = memoryview((line + "\n").encode())
         begin = self._size
+        # Whoever removed it removes all that is written from now on.
+        if not os.fstat(self._file.fileno()).st_nlink and not self.path.exists():
+            raise FileNotFoundError(errno.ENOENT, f"its {LINES} was removed", str(self.path))
         try:
             while data:  # a disk that is nearly full takes a part
                 count = self._file.write(data)
@@ -98,9 +104,24 @@ def cut_unfinished_line(folder: Path) -> None:
         file.truncate(whole)
 
 
+def own_folder(folder: Path) -> int | None:
+    """`lock_folder` of a run's folder, which comes before anything is written there.
+
+    Raises ToftrackError where a run is writing into the folder, and OSError.
+    """
+    with _one_writer(folder):
+        return lock_folder(folder)
+
+
 def _lock(file: IO[bytes], folder: Path) -> None:
-    try:
+    with _one_writer(folder):
         lock(file)
+
+
+@contextmanager
+def _one_writer(folder: Path) -> Iterator[None]:
+    try:
+        yield
     except BlockingIOError:
         raise ToftrackError(
             f"another run is writing into the folder '{folder}' just now; wait for its end, or "

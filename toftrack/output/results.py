@@ -104,12 +104,12 @@ class ResultWriter:
         """Write the line of a frame, with an estimate for each slot, to disk; or ToftrackError."""
         try:
             self._lines.append(json_line(estimates))
+            self.frames += 1
             if self._records is None:
                 self._records = Records(self.folder, estimates[0].latent.size, len(estimates))
             self._records.append(estimates)
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
-        self.frames += 1
 
     def close(self) -> None:
         """Write track.npz and summary.json, or ToftrackError; a second call does nothing."""
@@ -317,10 +317,16 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 def _unwritable(folder: Path, error: OSError, frames: int | None = None) -> ToftrackError:
     reason = error.strerror or error
+    if frames and not folder.exists():
+        return ToftrackError(
+            f"the output folder '{folder}' was removed or renamed while the run went on; where it "
+            f"is now, `toftrack recover` makes the files of the {frames} frames until then"
+        )
     if frames:
         return ToftrackError(
             f"the output folder '{folder}' cannot be written any more ({reason}); the {frames} "
-            f"frames until then are in its {LINES}: make room, then `toftrack recover {folder}`"
+            f"frames until then are in its {LINES}: make room, or make it writable, then `toftrack "
+            f"recover {folder}`"
         )
     return ToftrackError(
         f"the output folder '{folder}' cannot be written ({reason}); choose another with "

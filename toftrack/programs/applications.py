@@ -26,6 +26,12 @@ _WITH_VALUE = frozenset(
     "--experimental-rerun".split()
 )
 """Hydra's options that are followed by a value."""
+_SHORT = tuple("-h -c -p -r -m -sc -i".split())
+_LONG = (
+    "--help --hydra-help --version --cfg --resolve --package --run --multirun --shell-completion "
+    "--config-path --config-name --config-dir --experimental-rerun --info"
+).split()
+"""All of Hydra's options."""
 _KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
 
 
@@ -96,6 +102,13 @@ def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> lis
         return others
     if "" in files:
         raise ToftrackError("the recording's name is empty; give that of a file")
+    for word in files:
+        setting = word.rstrip(":")
+        if not _exists(word) and (setting in (*known, "") or "=" in (word[0], word[-1])):
+            key = setting if setting in known and setting else "device"
+            raise ToftrackError(
+                f"'{word}' is no recording; settings are given without blanks as {key}=VALUE"
+            )
     if len(files) > 1:
         raise ToftrackError(
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
@@ -137,12 +150,31 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     overrides: list[str] = []
     value_follows = False
     for word in arguments:
+        if word.startswith("-") and not value_follows:
+            _check_option(word.partition("=")[0])
         if not word.startswith("-") and not value_follows:
-            overrides.append(word)
+            overrides.append(_readable(word))
         else:  # the value of --info may be left out, and would be an override
             options.append("--info=all" if word in ("--info", "-i") else word)
         value_follows = not value_follows and word in _WITH_VALUE
     return [*options, *overrides]
+
+
+def _check_option(word: str) -> None:
+    """ToftrackError for an option that is none of Hydra's, which would print all that it has."""
+    if not any(map(word.startswith, _SHORT)) and not any(o.startswith(word) for o in _LONG):
+        raise ToftrackError(
+            f"there is no option {word}; settings are given as KEY=VALUE, without dashes and "
+            "blanks, and --help tells which"
+        )
+
+
+def _readable(override: str) -> str:
+    """Of letters outside of quotes Hydra reads those of ASCII alone, as in a folder's name."""
+    key, _, value = override.partition("=")
+    if value.isascii() or set(value) & set("""'"[]{}(),$"""):
+        return override
+    return f"{key}={quoted(value)}"
 
 
 def _is_file(argument: str, known: Collection[str]) -> bool:

@@ -18,7 +18,7 @@ import traceback
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
@@ -27,8 +27,10 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, sentence
+from toftrack.errors import ToftrackError
 from toftrack.files.json_text import read_object
 from toftrack.files.safe_files import let_links_go, write_whole
+from toftrack.output.files import own_folder
 from toftrack.programs import shutdown
 
 
@@ -40,6 +42,8 @@ class _Program:
     tracebacks: bool = False
     failed_jobs: set[Path] = field(default_factory=set)
     """Their folders."""
+    locks: list[int] = field(default_factory=list)
+    """Descriptors of the folders that nobody else may write into."""
 
 
 _program = _Program()
@@ -92,6 +96,8 @@ def run(main: Callable[[], object]) -> int:
             with contextlib.suppress(OSError):  # the error that is being reported counts for more
                 _clear(folder, parents)
         _new_folders.clear()
+        while _program.locks:
+            os.close(_program.locks.pop())
         _program.running = False
     if _program.failed_jobs:
         count = len(_program.failed_jobs)
@@ -103,7 +109,14 @@ def run(main: Callable[[], object]) -> int:
 def plain_parser(program: str, about: str | None) -> argparse.ArgumentParser:
     """A parser whose help shows a text, of several lines, as it stands."""
     kind = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(prog=program, description=about, formatter_class=kind)
+    return Parser(prog=program, description=about, formatter_class=kind)
+
+
+class Parser(argparse.ArgumentParser):
+    """Says what is wrong in one sentence, without all that there is."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ToftrackError(f"{message}; {self.prog} --help tells what there is")
 
 
 def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], float]:
@@ -190,7 +203,8 @@ class FailedJobs(Callback):
         self._before: dict[Path, int] = {}
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        _expect(Path(config.hydra.run.dir))
+        # Before Hydra writes: two runs that begin together would share, or clear, one folder.
+        _expect(Path(config.hydra.run.dir), alone=True)
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = Path(config.hydra.sweep.dir)
@@ -206,12 +220,21 @@ class FailedJobs(Callback):
                 _program.failed_jobs.add(path.parent)
 
 
-def _expect(folder: Path) -> None:
-    """A run or a sweep is about to make this folder. One with files in it is nobody's to clear."""
-    _let_links_go(folder)
+def _expect(folder: Path, alone: bool = False) -> None:
+    """A run or a sweep is about to make this folder. One with files in it is nobody's to clear.
+
+    alone: it is to have the folder for itself.
+    """
     path = folder.absolute()
+    new = tuple(place for place in (path, *path.parents) if not place.exists())
+    try:
+        with contextlib.suppress(OSError):  # Hydra will say it, too
+            if alone and _program.running and (lock := own_folder(path)) is not None:
+                _program.locks.append(lock)
+    except ToftrackError as error:
+        raise _JobFailedError(error) from error
+    _let_links_go(folder)
     if not path.exists() or path.is_dir() and not any(path.iterdir()):
-        new = tuple(place for place in (path, *path.parents) if not place.exists())
         _new_folders.setdefault(path, new)
 
 

@@ -9,7 +9,6 @@ lens: give `--intrinsics FX FY CX CY` (pixels) or `--camera FILE`.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -20,6 +19,7 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
+from toftrack.programs.command_line import Parser
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.image_folder import PngFolderWriter
@@ -39,7 +39,7 @@ _MILLIMETRE = 0.001
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and convert. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(prog="toftrack convert", description=__doc__)
+    parser = Parser(prog="toftrack convert", description=__doc__)
     add = parser.add_argument
     add("source", metavar="IN", help="the recording to read")
     add("target", metavar="OUT", help=".srs, .npz, or a folder")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 
@@ -12,12 +11,13 @@ from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_
 from toftrack.evaluation.public import evaluate, table, totals
 from toftrack.files.safe_files import write_whole
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.programs.command_line import Parser
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, track, print the table. Raises ToftrackError."""
     about = "Evaluate the tracker on a public data set of labelled depth images."
-    parser = argparse.ArgumentParser(prog="toftrack evaluate", description=about)
+    parser = Parser(prog="toftrack evaluate", description=about)
     add = parser.add_argument
     add("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
     add("folder", metavar="FOLDER", help="where the data set lies")

@@ -7,7 +7,6 @@ known and those in the file; `remove` takes a gesture out of it.
 
 from __future__ import annotations
 
-import argparse
 import math
 import sys
 from collections.abc import Sequence
@@ -24,6 +23,7 @@ from toftrack.errors import ToftrackError
 from toftrack.gestures.definitions import OTHER, SETS
 from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
 from toftrack.gestures.recognition import FLEXION_RAD, Gestures, gestures_with
+from toftrack.programs.command_line import Parser
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_source
 
@@ -34,7 +34,7 @@ _LEAD_S = 1.0
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and do what it says. Raises ToftrackError."""
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="toftrack gesture",
         description="Your own gestures: learn one from a recording, list or remove them.",
         usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",

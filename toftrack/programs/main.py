@@ -10,6 +10,7 @@ from pathlib import Path
 
 import toftrack
 from toftrack.configuration import configuration_folder
+from toftrack.programs.shutdown import say
 
 _COMMANDS = {
     "track": "follow a hand",
@@ -80,17 +81,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default this process's; returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if not given or given[0] in (*_HELP, "help"):
-        print(overview())
+        say(overview(), sys.stdout)
         return 0
     name, rest = given[0], given[1:]
     if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
-        print(f"toftrack {toftrack.__version__}")
+        say(f"toftrack {toftrack.__version__}", sys.stdout)
         return 0
     if name not in _COMMANDS:
         print(f"error: {_unknown(name)}", file=sys.stderr)
         return 1
     if name in _LONG_HELP and any(word in _HELP for word in rest):
-        print(long_help(name))
+        say(long_help(name), sys.stdout)
         return 0
     gc.set_threshold(20_000)  # loading and compiling leave little to collect
     from toftrack.programs.command_line import run

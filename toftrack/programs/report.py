@@ -7,7 +7,6 @@ spread over seeds. Jobs that failed are named and left out of the means.
 
 from __future__ import annotations
 
-import argparse
 import csv
 import io
 import math
@@ -23,6 +22,7 @@ import yaml
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import open_to_read, write_whole
+from toftrack.programs.command_line import Parser
 from toftrack.views.figures import chart
 
 _FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
@@ -252,7 +252,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
     about = "Gather the jobs of a sweep into one table."
-    parser = argparse.ArgumentParser(prog="toftrack report", description=about)
+    parser = Parser(prog="toftrack report", description=about)
     parser.add_argument("folder", help="the sweep's folder, multirun/DATE/TIME")
     about = "of summary.json, as metrics.fingertip_mm; default the mean joint error"
     parser.add_argument("--figure", help=about)

@@ -149,6 +149,7 @@ class Recorder:
     def _take(self, frame: Frame) -> None:
         try:
             self._write(frame)
+            space = self._file.has_space(_SPARE_BYTES)
         except OSError as error:
             self._end(error.strerror or str(error), failed=True)
         except Exception as error:  # of whatever kind, nobody is to wait for this thread
@@ -156,7 +157,7 @@ class Recorder:
         else:
             if self._file.bytes >= self._limit_gb * _GIGABYTE:
                 self._end(f"it has {self._limit_gb:g} GB, its limit", failed=False)
-            elif not self._file.has_space(_SPARE_BYTES):
+            elif not space:
                 self._end("the disk is nearly full", failed=False)
 
     def _write(self, frame: Frame) -> None:
@@ -221,6 +222,9 @@ class Recorder:
         """Finish the file; no more frames are taken."""
         self._file.close()
         try:
+            if self.frames and not os.path.lexists(self._part):
+                gone = f"'{self._part}' was removed or renamed while the recording grew"
+                raise ToftrackError(f"the recording '{self.path}' was not made: {gone}")
             if self.frames:
                 finish(self._part, self.path, self._overwrite)
                 reported = f"the recording '{self.path}' ends after {self.frames} frames: {why}"

@@ -153,7 +153,10 @@ class SrsWriter:
         self.frames += 1
 
     def close(self) -> None:
+        """Without a frame there is no file."""
         self._file.close()
+        if not self.frames:
+            self.path.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
         return self
@@ -163,7 +166,8 @@ class SrsWriter:
 
     def _write(self, content: bytes) -> None:
         what = f"the recording '{self.path}' cannot be written any further"
-        with reported_errors(what, f"free some space; its {self.frames} whole frames are kept"):
+        kept = f"; its {self.frames} whole frames are kept" * bool(self.frames)
+        with reported_errors(what, f"free some space{kept}"):
             self._file.write(content)
 
 

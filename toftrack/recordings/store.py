@@ -106,8 +106,8 @@ def open_recording(
     if suffix != ".npz":
         with reading(file_of(path)), open_to_read(path) as stream:
             if stream.read(2) != b"PK":
-                kind = f"files that end with {suffix}" if suffix else "a file without an ending"
-                raise ToftrackError(f"'{path}' is not read, as are no {kind}; give {_READ}")
+                kind = f"that end with {suffix}" if suffix else "without an ending"
+                raise ToftrackError(f"'{path}' is not read, as are no files {kind}; give {_READ}")
     return read_recording(path)
 
 
