@@ -56,7 +56,10 @@ def read_matlab(path: Path, name: str) -> np.ndarray:
 
 
 def _said(path: Path, *name: str) -> bytes:
-    _check_unpacked(path)
+    try:
+        _check_unpacked(path)
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
     command = [sys.executable, "-P", "-c", _PROGRAM, *name]  # no modules of the folder that we are in
     with open_to_read(path) as stream:
         done = subprocess.run(command, stdin=stream, capture_output=True, check=False)
@@ -74,7 +77,10 @@ def _check_unpacked(path: Path) -> None:
         while len(tag := stream.read(8)) == 8:
             kind, size = struct.unpack(order + "II", tag)
             end, unpacked, unpack = stream.tell() + size, 0, zlib.decompressobj()
-            while kind == _COMPRESSED and (piece := stream.read(min(2**20, end - stream.tell()))):
+            while kind == _COMPRESSED and not unpack.eof:
+                piece = stream.read(min(2**20, end - stream.tell()))
+                if not piece:
+                    break
                 while piece:
                     unpacked += len(unpack.decompress(piece, 2**20))
                     piece = unpack.unconsumed_tail
