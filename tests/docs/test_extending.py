@@ -170,7 +170,9 @@ def test_an_installed_part_stands_behind_toftracks_own(package: Path) -> None:
         toftrack.make_tracker("pose_space=late")
 
 
-@pytest.mark.parametrize("text", ["[toftrack.devices]\nlate = not one!\n", "[toftrack.devices]\nx", "\ufeff["])
+@pytest.mark.parametrize(
+    "text", ["[toftrack.devices]\nlate = not one!\n", "[toftrack.devices]\nx", "\ufeff["]
+)
 def test_what_a_damaged_package_brings_is_left_out(package: Path, text: str) -> None:
     (package / "site" / "mine-1.0.dist-info" / "entry_points.txt").write_text(text)
     with pytest.raises(ToftrackError, match="there is no device=late"):

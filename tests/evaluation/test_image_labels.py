@@ -93,10 +93,20 @@ def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> N
         {"image_size": [1, 2], "side": "up", "frames": {}},
         {"image_size": [1, 2], "side": "left", "frames": {"0": {"points": {"nose": [1, 2, "x"]}}}},
         {"image_size": [1, 2], "side": "left", "images": [3], "called": {}, "shown_frames": 1},
-        {"image_size": [1, 2], "side": "left", "images": [3], "called": {"3": []}, "shown_frames": 1e9},
+        {
+            "image_size": [1, 2],
+            "side": "left",
+            "images": [3],
+            "called": {"3": []},
+            "shown_frames": 1e9,
+        },
         {"image_size": [float("inf"), 2], "side": "left", "frames": {}},
         {"image_size": [1, 2], "side": "left", "frames": {"05": _FRAME}},
-        {"image_size": [1, 2], "side": "left", "frames": {"5": {"points": {"wrist": [0, float("nan"), "guessed"]}}}},
+        {
+            "image_size": [1, 2],
+            "side": "left",
+            "frames": {"5": {"points": {"wrist": [0, float("nan"), "guessed"]}}},
+        },
     ],
 )
 def test_labels_of_neither_kind_are_reported_in_one_sentence(tmp_path, content) -> None:

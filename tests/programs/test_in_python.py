@@ -164,7 +164,12 @@ def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:
 
 @pytest.mark.parametrize(
     ("depth", "time_s"),
-    [(None, 0.0), (np.ones((2, 2)), 0.0), (sample().depth_m[0] + 0j, 0), (sample().depth_m[0], "a")],
+    [
+        (None, 0.0),
+        (np.ones((2, 2)), 0.0),
+        (sample().depth_m[0] + 0j, 0),
+        (sample().depth_m[0], "a"),
+    ],
 )
 def test_what_is_no_frame_is_refused_where_it_is_pushed(depth: Any, time_s: Any) -> None:
     camera = toftrack.PushDevice(Sample().camera)
