@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 import math
+import re
 from collections.abc import Iterator
 from numbers import Integral, Real
 from types import ModuleType
@@ -12,10 +13,21 @@ from typing import Any
 
 MOST_HANDS = 8
 """That are followed at once."""
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]+")
+_LONGEST_REASON = 300
+"""Some libraries repeat the whole input."""
 
 
 class ToftrackError(Exception):
     """Bad input or environment; the message is one clear sentence: what, where, what to do."""
+
+    def __str__(self) -> str:
+        return one_line(super().__str__())
+
+
+def one_line(text: str) -> str:
+    """A text with names that others chose, as a terminal may show it: no line ends, no escapes."""
+    return _CONTROL.sub(" ", text)
 
 
 @contextlib.contextmanager
@@ -27,7 +39,7 @@ def reported_errors(what: str, remedy: str, *kinds: type[Exception]) -> Iterator
     try:
         yield
     except expected as error:
-        reason = " ".join(str(getattr(error, "strerror", None) or error).split())
+        reason = " ".join(str(getattr(error, "strerror", None) or error).split())[:_LONGEST_REASON]
         raise ToftrackError(f"{what} ({reason}); {remedy}") from error
 
 

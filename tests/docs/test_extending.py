@@ -170,6 +170,25 @@ def test_an_installed_part_stands_behind_toftracks_own(package: Path) -> None:
         toftrack.make_tracker("pose_space=late")
 
 
+@pytest.mark.parametrize(
+    "text", ["[toftrack.devices]\nlate = not one!\n", "[toftrack.devices]\nx", "\ufeff["]
+)
+def test_what_a_damaged_package_brings_is_left_out(package: Path, text: str) -> None:
+    (package / "site" / "mine-1.0.dist-info" / "entry_points.txt").write_text(text)
+    with pytest.raises(ToftrackError, match="there is no device=late"):
+        configuration("device=late")
+    assert configuration("seed=1").seed == 1
+
+
+def test_a_part_that_exits_while_it_loads_is_told(package: Path) -> None:
+    (package / "my_camera.py").write_text("raise SystemExit(0)")
+    (package / "my.yaml").parent.joinpath("device").mkdir()
+    (package / "device" / "odd.yaml").write_text("_target_: my_camera.Camera\n")
+    status, _, err = programs.call("--config-dir", ".", "device=odd", folder=package)
+    assert (status, "Traceback" in err) == (1, False)
+    assert "error: a part that is not toftrack's ended it, in <module> (" in err
+
+
 KIND = "holds a pose space of the kind 'autoencoder.Autoencoder', which is not there; there are"
 
 

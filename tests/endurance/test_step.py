@@ -33,6 +33,7 @@ _PATIENT = settings(
 _ODD = (np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-30, 1e30, 0.3, 70.0)
 _TIMES = st.one_of(
     *(st.none(), st.floats(), st.floats(-1e9, 1e9)),
+    st.sampled_from(["1", "x", 1j, [0.1], np.ones(2), 10**400]),
     st.sampled_from([0.0, 0.04, 0.08, 0.12, -5.0, 1e6, np.nan, np.inf, -np.inf, np.float32(0.2)]),
 )
 

@@ -17,7 +17,6 @@ from toftrack.evaluation.datasets import (
     INTEL_CREATIVE,
     NYU_CAMERA,
     open_data_set,
-    read_matlab,
 )
 
 FRAMES = 3
@@ -216,27 +215,6 @@ def test_other_contents_of_joint_data_are_refused(
     write("NYU", tmp_path, 1)
     savemat(file_of(tmp_path, ".mat"), content)
     assert reason in refusal("NYU", tmp_path)
-
-
-def test_numbers_of_matlab_files_are_read_in_their_own_type(tmp_path: Path) -> None:
-    wanted = np.random.default_rng(0).integers(0, 200, (2, 3, 4, 5)).astype(np.int16)
-    content = {"before": {"a": np.eye(2)}, "wanted": wanted, "x": np.arange(3.0)}
-    savemat(tmp_path / "some.mat", content, do_compression=True)
-    read = read_matlab(tmp_path / "some.mat", "wanted")
-    assert read.dtype == wanted.dtype
-    np.testing.assert_array_equal(read, wanted)
-
-
-def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path) -> None:
-    """As SciPy 1.17 does where the type of an array's elements is none."""
-    path = tmp_path / "some.mat"
-    savemat(path, {"a": np.eye(9)})
-    content = bytearray(path.read_bytes())
-    at = content.index(np.array([9, 8 * 81], "<u4").tobytes())
-    content[at] = 127
-    path.write_bytes(content)
-    with pytest.raises(ToftrackError, match="cannot be used .*; copy the data set again"):
-        read_matlab(path, "a")
 
 
 def test_colour_images_in_place_of_depth_are_refused(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from toftrack.evaluation.measures import FLAG_COUNTS
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 ALL_OK = np.ones((3, 21), bool)
+_FRAME = {"points": {"wrist": [0, 0, "visible"]}}
 
 
 def labels(tmp_path, content) -> Points | Stills:
@@ -92,6 +93,20 @@ def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> N
         {"image_size": [1, 2], "side": "up", "frames": {}},
         {"image_size": [1, 2], "side": "left", "frames": {"0": {"points": {"nose": [1, 2, "x"]}}}},
         {"image_size": [1, 2], "side": "left", "images": [3], "called": {}, "shown_frames": 1},
+        {
+            "image_size": [1, 2],
+            "side": "left",
+            "images": [3],
+            "called": {"3": []},
+            "shown_frames": 1e9,
+        },
+        {"image_size": [float("inf"), 2], "side": "left", "frames": {}},
+        {"image_size": [1, 2], "side": "left", "frames": {"05": _FRAME}},
+        {
+            "image_size": [1, 2],
+            "side": "left",
+            "frames": {"5": {"points": {"wrist": [0, float("nan"), "guessed"]}}},
+        },
     ],
 )
 def test_labels_of_neither_kind_are_reported_in_one_sentence(tmp_path, content) -> None:

@@ -56,6 +56,14 @@ def test_every_change_is_in_the_file_and_the_benchmark_reads_it(tmp_path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["labels.json"]
 
 
+def test_a_file_with_what_json_has_not_is_told_of(tmp_path) -> None:
+    opened(tmp_path).begin([3])
+    path = tmp_path / "labels.json"
+    path.write_text(path.read_text().replace('"frames"', '"mine": NaN, "frames"'))
+    with pytest.raises(ToftrackError, match="labels.json' cannot be written .*; give another"):
+        opened(tmp_path).begin([4])
+
+
 def test_a_file_is_continued_with_all_that_is_in_it(tmp_path) -> None:
     first = opened(tmp_path)
     first.begin([3, 12])

@@ -182,6 +182,7 @@ def test_save_and_load_keep_the_lens(tmp_path: Path, count: int) -> None:
         ({"K": [[1, 0], [0, 1]]}, "3x3"),
         ({"distortion": [0, 0]}, "4, 5, 8, 12, 14 numbers.*has 2"),
         ({"lens": "mirror"}, "opencv or fisheye.*mirror"),
+        ({"depth_polynomial": [0.1] * 10**5}, "100000 coefficients"),
     ],
 )
 def test_bad_camera_file_is_reported(tmp_path: Path, change: dict[str, Any], words: str) -> None:

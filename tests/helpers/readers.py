@@ -6,6 +6,7 @@ import json
 import shutil
 import zipfile
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -15,17 +16,20 @@ import cv2
 import numpy as np
 from helpers import bags, videos
 from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
-from helpers.tracking import run
+from helpers.tracking import ROOT, run
+from hydra.utils import instantiate
 from scipy.io import savemat
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.compose import configuration
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import onnx_file, read_session
 from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights
 from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA, open_data_set
+from toftrack.evaluation.image_labels import read_labels
+from toftrack.evaluation.labelling import LabelFile
 from toftrack.frames.camera import Camera
 from toftrack.gestures.files import NamedPose, read_poses, save_poses
 from toftrack.hand.shape import HandShape, default_hand_shape
@@ -42,6 +46,7 @@ from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.unfinished import Facts, UnfinishedRecording, compressed, recover_recording
+from toftrack.views.labelling.page import LabelPage
 
 HEIGHT, WIDTH, FRAMES = 24, 32, 3
 _MOST_FRAMES = 4
@@ -244,7 +249,16 @@ def _small_files(folder: Path) -> list[Reader]:
         parameter.data.zero_()  # takes hardly any room
     save_weights(small / "weights.npz", *networks, {"steps": 1})
     shutil.copy(onnx_file(DEFAULT_FILE, "finder"), small / "weights.finder.onnx")
+    labels = LabelFile(small / "labels.json", "a.npz", (WIDTH, HEIGHT), 9, "left")
+    labels.begin([2, 5])
+    labels.set_point(5, "index_tip", [1, 2, "visible"])
+    labels.set_gesture(2, "palm")
+    stills = {"image_size": [4, 3], "side": "left", "shown_frames": 2, "images": [1, 2]}
+    stills |= {"called": {"1": ["palm"], "2": ["other", ""]}}
+    (small / "stills.json").write_text(json.dumps(stills))
     readers: dict[str, Callable[[Path], object]] = {
+        "labels.json": go_on_labelling,
+        "stills.json": read_labels,
         "gestures.json": read_poses,
         "gestures.csv": read_poses,
         "poses.csv": lambda path: file_data(str(path)),
@@ -259,6 +273,18 @@ def _small_files(folder: Path) -> list[Reader]:
     return [_alone(name, small / name, read) for name, read in readers.items()]
 
 
+def go_on_labelling(path: Path) -> None:
+    """As `toftrack label` continues a file, and `benchmark accuracy` reads it."""
+    read_labels(path)
+    labels = LabelFile(path, "a.npz", (WIDTH, HEIGHT), 9, None)
+    labels.begin([2, 5, 7])
+    labels.set_point(2, "wrist", [3, 4, "guessed"])
+    with closing(LabelPage(labels, (), (), 0)) as page:
+        json.dumps(page.about(), allow_nan=False)
+    assert labels.labelled() <= len(labels.frames)
+    read_labels(path)
+
+
 def _configurations(folder: Path) -> list[Reader]:
     """Composed only: what they name is executed by whoever uses them."""
     own, job = folder / "conf", _new(folder, "sweep") / "0"
@@ -266,7 +292,11 @@ def _configurations(folder: Path) -> list[Reader]:
     (job / ".hydra").mkdir(parents=True)
     (job / ".hydra" / "overrides.yaml").write_text("- filter.particles=100\n- seed=1\n")
     (job / "summary.json").write_text('{"frames": 3, "metrics": {"mean_mm": 5.5}}')
+    parts = folder / "plugins"
+    shutil.copytree(ROOT / "docs" / "examples" / "plugins", parts)
+    chosen = {f"{path.parent.name}={path.stem}": path for path in sorted(parts.glob("*/*.yaml"))}
     return [
+        *(Reader(f"part {choice}", path, path, make_part) for choice, path in chosen.items()),
         Reader("config.yaml", own / "config.yaml", own, compose),
         Reader("group: a .yaml", own / "segmentation" / "nearest.yaml", own, compose),
         Reader("overrides.yaml", job / ".hydra" / "overrides.yaml", job.parent, read_runs),
@@ -276,6 +306,15 @@ def _configurations(folder: Path) -> list[Reader]:
 def compose(folder: Path) -> None:
     """A configuration of one's own."""
     configuration("seed=1", config_dir=folder)
+
+
+def make_part(path: Path) -> None:
+    """The part that a file in a folder of one's own describes, where that takes no time."""
+    group = path.parent.name
+    config = configuration(f"{group}={path.stem}", config_dir=path.parents[1])
+    if group == "likelihood":
+        with one_sentence():
+            instantiate(config.likelihood)
 
 
 def read_weights(path: Path) -> None:

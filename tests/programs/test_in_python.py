@@ -8,6 +8,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -159,6 +160,23 @@ def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:
         sent = [json.loads(receiver.recv(65535)) for _ in smooth]
     assert np.allclose([line["joints_m"] for line in sent], smooth, atol=1e-6)
     assert not np.array_equal(tracking.results().joints_m[2], smooth[2])
+
+
+@pytest.mark.parametrize(
+    ("depth", "time_s"),
+    [
+        (None, 0.0),
+        (np.ones((2, 2)), 0.0),
+        (sample().depth_m[0] + 0j, 0),
+        (sample().depth_m[0], "a"),
+    ],
+)
+def test_what_is_no_frame_is_refused_where_it_is_pushed(depth: Any, time_s: Any) -> None:
+    camera = toftrack.PushDevice(Sample().camera)
+    with pytest.raises(toftrack.ToftrackError):
+        camera.push(depth, time_s)
+    camera.end()
+    assert not list(camera) and camera.dropped == 0
 
 
 def test_of_frames_that_are_pushed_the_newest_is_tracked() -> None:

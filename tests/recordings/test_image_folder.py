@@ -23,7 +23,7 @@ from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import read_run
 from toftrack.programs import convert
 from toftrack.programs.main import main
-from toftrack.recordings import image_folder
+from toftrack.recordings import image_folder, images
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.image_folder import read_image_folder
 from toftrack.recordings.images import decoded_png
@@ -249,7 +249,7 @@ def test_archives_that_lie_or_would_fill_the_memory_are_refused(
 ) -> None:
     monkeypatch.setattr(image_folder, "_MOST_BYTES", 2**20)
     path = laid_out(tmp_path, {"1.png": png(0) + bytes(2**22)}, True)
-    with pytest.raises(ToftrackError, match="larger than any camera's image"):
+    with pytest.raises(ToftrackError, match="larger than 1 MB"):
         read_image_folder(path, bare=GIVEN)
     content = laid_out(tmp_path, {"1.png": png(0)}, True).read_bytes()
     for size in (20, 2**31):  # in both places that tell it
@@ -261,6 +261,37 @@ def test_archives_that_lie_or_would_fill_the_memory_are_refused(
         path.write_bytes(damaged(content, seed))
         with contextlib.suppress(ToftrackError):
             read_image_folder(path, bare=GIVEN).image(0)
+
+
+@pytest.mark.parametrize("text", ["1 " * 2**20, "x" * 2**22, "1 " * 2**24, "", "nan"])
+def test_times_that_cannot_be_meant_take_no_time_and_no_page(tmp_path: Path, text: str) -> None:
+    path = laid_out(tmp_path, {"1.png": png(0), "timestamps.txt": text.encode()}, True)
+    with pytest.raises(ToftrackError, match="timestamps.txt") as caught:
+        read_image_folder(path, bare=GIVEN)
+    assert len(str(caught.value)) < 999
+
+
+def test_names_of_thousands_of_digits_are_in_order(tmp_path: Path) -> None:
+    names = ["a2.png", "a10.png", f"a{'1' * 5000}.png", f"a{'2' * 5000}.png"]
+    path = laid_out(tmp_path, dict.fromkeys(reversed(names), png(0)), True)
+    with Replay(path, intrinsics=GIVEN.intrinsics) as device:
+        assert device.description["files"] == names
+
+
+def test_names_of_others_do_not_command_the_terminal(tmp_path: Path) -> None:
+    path = laid_out(tmp_path, {"a\x1b[2J\n.png": b"nonsense"}, True)
+    with pytest.raises(ToftrackError) as caught:
+        read_image_folder(path, bare=GIVEN)
+    assert str(caught.value).isprintable()
+
+
+def test_an_exr_with_more_in_it_than_an_image_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(images, "LARGEST_PIXELS", 2 * DEPTH[0].size)
+    read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A")}, False), bare=GIVEN)
+    with pytest.raises(ToftrackError, match="larger than any camera's"):
+        read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A B")}, False), bare=GIVEN)
 
 
 def test_an_exr_that_is_damaged_is_read_or_told(tmp_path: Path) -> None:

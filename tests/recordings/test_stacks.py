@@ -20,9 +20,10 @@ from toftrack.api import make_device
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert
-from toftrack.recordings import stacks
+from toftrack.recordings import matlab
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
+from toftrack.recordings.matlab import read_matlab
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.store import ELSEWHERE, open_recording
 
@@ -181,13 +182,56 @@ def test_what_hdf5_keeps_elsewhere_or_makes_of_nothing_is_not_read(tmp_path: Pat
 def test_a_mat_file_that_would_fill_the_memory_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(stacks, "MOST_BYTES", 2**22)
+    monkeypatch.setattr(matlab, "MOST_BYTES", 2**22)
     packer = zlib.compressobj(9)
     packed = b"".join(packer.compress(bytes(2**16)) for _ in range(70)) + packer.flush()
     header = b"MATLAB 5.0 MAT-file".ljust(124) + b"\x00\x01IM"
     (tmp_path / "a.mat").write_bytes(header + struct.pack("<II", 15, len(packed)) + packed)
     with pytest.raises(ToftrackError, match="larger than a gigabyte"):
         opened(tmp_path / "a.mat")
+
+
+def test_numbers_of_matlab_files_are_read_in_their_own_type(tmp_path: Path) -> None:
+    wanted = np.random.default_rng(0).integers(0, 200, (2, 3, 4, 5)).astype(np.int16)
+    content: dict[str, Any] = {"before": {"a": np.eye(2)}, "wanted": wanted, "x": np.arange(3.0)}
+    savemat(tmp_path / "some.mat", content, do_compression=True)
+    read = read_matlab(tmp_path / "some.mat", "wanted")
+    assert read.dtype == wanted.dtype
+    np.testing.assert_array_equal(read, wanted)
+
+
+def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path) -> None:
+    """As SciPy 1.17 does where the type of an array's elements is none."""
+    savemat(tmp_path / "a.mat", {"a": METRES.astype(np.float64)})
+    content = bytearray((tmp_path / "a.mat").read_bytes())
+    content[content.index(np.array([9, 8 * METRES.size], "<u4").tobytes())] = 127
+    (tmp_path / "a.mat").write_bytes(content)
+    with pytest.raises(ToftrackError, match="a.mat' cannot be read .*; it is damaged"):
+        opened(tmp_path / "a.mat")
+
+
+def test_modules_beside_a_matlab_file_are_not_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "numpy.py").write_text("raise SystemExit(1)")
+    monkeypatch.chdir(tmp_path)
+    assert len(opened(mat(tmp_path / "a.mat", depth=METRES))) == COUNT
+
+
+def test_an_archive_that_is_called_npy_is_no_stack(tmp_path: Path) -> None:
+    with open(tmp_path / "a.npy", "wb") as file:
+        np.savez(file, depth_m=METRES)
+    with pytest.raises(ToftrackError, match="a.npy' cannot be read"):
+        opened(tmp_path / "a.npy")
+
+
+def test_a_deep_pile_of_groups_takes_no_time(tmp_path: Path) -> None:
+    with h5py().File(tmp_path / "a.h5", "w") as file:
+        group = file
+        for _ in range(100):
+            group = group.create_group("a")
+    with pytest.raises(ToftrackError, match="nested too deeply"):
+        opened(tmp_path / "a.h5")
 
 
 def test_objects_of_a_mat_file_are_no_images(tmp_path: Path) -> None:

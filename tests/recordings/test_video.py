@@ -181,6 +181,14 @@ def test_lossless_grey_videos_are_depth_in_millimetres(
     np.testing.assert_array_equal(store.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
 
 
+@pytest.mark.parametrize("name", ["a.mkv", "a.avi", "a.nut"])
+def test_a_list_of_other_files_is_no_video(tmp_path: Path, name: str) -> None:
+    write_grey(tmp_path / "other.mkv", words())
+    (tmp_path / name).write_text("ffconcat version 1.0\nfile other.mkv\n")
+    with pytest.raises(ToftrackError, match="cannot be read as a video"):
+        open_recording(tmp_path / name, bare=REPORTED)
+
+
 def test_unit_and_rate_of_a_video_can_be_given(tmp_path: Path) -> None:
     pixels = words()
     bare = BareFacts((30.0, 31.0, 15.5, 11.5), unit_m=0.0002, fps=10.0)

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, is_dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from helpers.tracking import Scene, errors_mm, make_tracker, sample
 
+from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.tracking.tracker import Tracker
 
@@ -44,6 +46,24 @@ def equal(one: object, two: object) -> bool:
 def same(one: Estimate, two: Estimate) -> bool:
     """In everything but the time that it took."""
     return equal(one, replace(two, compute_s=one.compute_s))
+
+
+@pytest.mark.parametrize(
+    ("index", "timestamp_s"),
+    [("a", 0.0), (0, "soon"), (0, 1j), (0, [0.1]), (math.nan, 0.0), (0, 10**400)],
+)
+def test_a_number_and_a_time_that_are_none_are_refused(index: Any, timestamp_s: Any) -> None:
+    tracker, scene = quick(), sample()
+    with pytest.raises(ToftrackError, match="a whole number and seconds"):
+        tracker.step(scene.depth_m[0], scene.k, index, timestamp_s)
+
+
+def test_a_lens_that_is_covered_ends_no_run() -> None:
+    """Many cameras say 65535 millimetres where there is no reading."""
+    tracker, scene = quick(), sample()
+    covered = np.full_like(scene.depth_m[0], 65.535)
+    assert tracker.step(covered, scene.k).lost
+    assert not [tracker.step(scene.depth_m[0], scene.k) for _ in range(5)][-1].lost
 
 
 @pytest.mark.parametrize("kept", [0, 5])

@@ -6,6 +6,8 @@ none: nothing is imported because of what one says. docs/extending.md shows each
 
 from __future__ import annotations
 
+import functools
+import logging
 import os
 import pkgutil
 import sys
@@ -18,6 +20,8 @@ from omegaconf import OmegaConf
 
 from toftrack.configuration import configuration_folder
 from toftrack.errors import ToftrackError
+
+_log = logging.getLogger(__name__)
 
 ENTRY_POINTS = {
     "detector": "toftrack.detectors",
@@ -37,7 +41,17 @@ _LIKE = {"detector": "network", "gestures": "default", "pose_space": "pca"}
 
 def installed(group: str) -> dict[str, EntryPoint]:
     """The parts of a group in ENTRY_POINTS that installed packages bring, by their names."""
-    return {entry.name: entry for entry in entry_points(group=ENTRY_POINTS[group])}
+    try:
+        found = entry_points(group=ENTRY_POINTS[group])
+    except Exception as error:  # whatever a damaged file of any package raises
+        _told(" ".join(str(error).split()))
+        return {}
+    return {entry.name: entry for entry in found if entry.pattern.match(entry.value)}
+
+
+@functools.cache
+def _told(reason: str) -> None:
+    _log.warning("what installed packages bring is left out: an entry_points.txt says %s", reason)
 
 
 def offer_installed() -> None:

@@ -50,16 +50,16 @@ def sentence(error: BaseException) -> str:
         )
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         reported = next((cause for cause in chain if str(cause).strip()), error)
-        said = _of_config(reported) + _place(chain[-1])
+        said = _of_config(reported) + place_of(chain[-1])
         return _of_override(chain) or said or type(error).__name__
     text = _one_line(str(error))
     if text.startswith("Config group override must be"):
         return "a group was given a number, as likelihood=nan; give a choice's name, GROUP=NAME"
-    name = type(error).__name__ + (f": {text}" if text else "") + _place(error)
+    name = type(error).__name__ + (f": {text}" if text else "") + place_of(error)
     return f"unexpected {name} ({FULL_ERROR}=1 shows the traceback)"
 
 
-def _place(error: BaseException) -> str:
+def place_of(error: BaseException) -> str:
     """Where code of one's own raised it: class, file and line; "" where none did."""
     theirs = {e.module.split(".")[0] for name in ENTRY_POINTS for e in installed(name).values()}
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):

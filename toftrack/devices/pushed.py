@@ -10,8 +10,9 @@ from contextlib import suppress
 import numpy as np
 
 from toftrack.devices.base import BaseDevice
+from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.frames.frame import Frame
+from toftrack.frames.frame import Frame, checked_moment
 
 _LOOK_S = 0.1
 
@@ -27,12 +28,22 @@ class PushDevice(BaseDevice):
         self._count, self._ended = 0, False
 
     def push(self, depth: np.ndarray, timestamp_s: float | None = None) -> None:
-        """A copy of the next frame.  depth: (H, W) metres, Z.  timestamp_s: None is now."""
-        time_s = time.monotonic() if timestamp_s is None else timestamp_s
+        """A copy of the next frame.  depth: (H, W) metres, Z.  timestamp_s: None is now.
+
+        Raises ToftrackError here, and not where it is tracked, for what is no image of the camera.
+        """
+        now = time.monotonic() if timestamp_s is None else timestamp_s
+        count, time_s = checked_moment(self._count, now)
+        image = np.array(depth, copy=True)
+        if image.shape != (self.camera.height, self.camera.width) or image.dtype.kind not in "fiu":
+            raise ToftrackError(
+                f"an image of {image.dtype}, shape {image.shape}, was pushed; give numbers, "
+                f"{self.camera.height} rows and {self.camera.width} columns as the camera has"
+            )
         with suppress(queue.Empty):
             self._newest.get_nowait()
             self.dropped += 1
-        self._newest.put(Frame(self._count, time_s, np.array(depth), None, radial=False))
+        self._newest.put(Frame(count, time_s, image, None, radial=False))
         self._count += 1
 
     def end(self) -> None:

@@ -25,10 +25,7 @@ are compared, and the two ends of the wrist as their middle; the palm's middle h
 
 from __future__ import annotations
 
-import io
 import re
-import subprocess
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -40,6 +37,7 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.camera import Camera
 from toftrack.recordings.images import read_png
+from toftrack.recordings.matlab import read_matlab
 
 FPS = 30.0
 """Frames a second of all data sets."""
@@ -267,20 +265,6 @@ _NYU_POINTS = {20: 0, 18: 3, 16: 6, 14: 9, 12: 12, 10: 15, 8: 18, 6: 21, 4: 24, 
 _NYU_WRIST = (30, 31)
 _TEST_FRAMES, _FIRST_PERSON = 8252, 2440
 """The test part shows one person up to that frame, and another from there on."""
-_PROGRAM = """
-import io, sys
-import numpy
-from scipy.io import loadmat
-name, file = sys.argv[1], io.BytesIO(sys.stdin.buffer.read())
-arrays = loadmat(file, variable_names=[name])
-if name not in arrays:
-    raise ValueError(f"it has no array named {name}")
-if getattr(arrays[name], "dtype", numpy.dtype(object)).kind not in "fiu":
-    raise ValueError(f"{name} does not consist of real numbers")
-numpy.save(sys.stdout.buffer, arrays[name], allow_pickle=False)
-"""
-"""Reads the file from standard input and writes the array to standard output as `.npy`. SciPy's
-reader can crash on a damaged file, and so runs in a process of its own."""
 
 
 def _nyu(folder: Path) -> list[LabelledSequence]:
@@ -304,7 +288,10 @@ def _nyu_sequences(folder: Path) -> list[LabelledSequence]:
 
 def _nyu_labels(path: Path) -> np.ndarray:
     """(T, 12, 3) metres, camera frame: the wrist, then the fingers' points in toftrack's order."""
-    points, what = read_matlab(path, _NYU_KEY), f"{_NYU_KEY} in the file '{path}'"
+    what = f"{_NYU_KEY} in the file '{path}'"
+    used, remedy = f"the file '{path}' cannot be used", "copy the data set again"
+    with reported_errors(used, remedy, OSError, ValueError):
+        points = read_matlab(path, _NYU_KEY)
     if points.ndim != 4 or points.shape[2:] != (36, 3) or not points.size:
         raise _unusable(f"{what} has the shape {points.shape}, not (3, T, 36, 3)")
     frontal = points[0].astype(np.float64)
@@ -313,18 +300,6 @@ def _nyu_labels(path: Path) -> np.ndarray:
     wrist = frontal[:, _NYU_WRIST, :].mean(axis=1, keepdims=True)
     fingers = frontal[:, [_NYU_POINTS[row] for row in sorted(_NYU_POINTS)]]
     return _MILLIMETRE * np.concatenate([wrist, fingers], axis=1) * (1, -1, 1)
-
-
-def read_matlab(path: Path, name: str) -> np.ndarray:
-    """A real numeric array by its name, in its own type. Raises ToftrackError: the file is damaged
-    or of another version, or has no such array."""
-    command = [sys.executable, "-c", _PROGRAM, name]
-    done = subprocess.run(command, input=_bytes(path), capture_output=True, check=False)
-    if done.returncode != 0:
-        last = done.stderr.decode(errors="replace").strip().rpartition("\n")[2]
-        reason = last if done.returncode == 1 and last else "SciPy's reader crashes on it"
-        raise _unusable(f"the file '{path}' cannot be used ({reason})")
-    return np.load(io.BytesIO(done.stdout), allow_pickle=False)
 
 
 def _nyu_depth(path: Path) -> np.ndarray:

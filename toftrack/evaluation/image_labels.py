@@ -30,6 +30,7 @@ Each labelled image counts as a recording of its own in totals, intervals and di
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,6 +47,8 @@ from toftrack.hand.skeleton import JOINT_NAMES
 
 UNNAMED = ("", "other")
 _INSET_M = 0.005
+_MOST_SHOWN = 1000
+"""Frames of a still; more than any start takes."""
 _FLAGS = ("visible", "guessed", "absent")
 
 
@@ -85,7 +88,7 @@ def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Sti
     any that is visible. Raises ToftrackError, one sentence that names the file."""
     try:
         return _parsed(path, content, begun)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
         raise ToftrackError(
             f"the labels '{path}' are of neither kind that toftrack/evaluation/image_labels.py "
             f"describes ({type(error).__name__}: {error}); give points or stills"
@@ -101,6 +104,8 @@ def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
         frames = {int(key): _visible(frame["points"]) for key, frame in content["frames"].items()}
         if not (any(frames.values()) or begun) or min(frames, default=0) < 0:
             raise ValueError("no frame has a visible point")
+        if list(content["frames"]) != [str(number) for number in frames]:
+            raise ValueError("a frame's number is written in another way")
         return Points(path, (width, height), side, frames)
     called = {str(key): tuple(map(str, names)) for key, names in content["called"].items()}
     images = tuple(str(image) for image in content["images"])
@@ -108,8 +113,8 @@ def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
     for image in images:
         if image not in called:
             raise ValueError(f"'called' lacks {image}")
-    if not images or shown < 1:
-        raise ValueError("there is no image to show")
+    if not images or not 1 <= shown <= _MOST_SHOWN:
+        raise ValueError(f"there is no image to show, or more than {_MOST_SHOWN} times")
     return Stills(path, (width, height), side, shown, images, called)
 
 
@@ -119,6 +124,8 @@ def _visible(points: Any) -> dict[int, tuple[float, float]]:
         if flag not in _FLAGS:
             raise ValueError(f"the flag {flag!r} is unknown")
         row = JOINT_NAMES.index(name)
+        if flag != "absent" and not math.isfinite(u + v):
+            raise ValueError(f"the pixel {u}, {v} is none")
         if flag == "visible":
             found[row] = float(u), float(v)
     return found

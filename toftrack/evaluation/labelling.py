@@ -268,10 +268,9 @@ class LabelFile:
         if self.content["side"] is None:
             return
         frames = {number: self.frames[number] for number in map(str, self.numbers())}
-        text = json.dumps(self.content | {"frames": frames}, indent=1, allow_nan=False)
-        with reported_errors(
-            f"the labels '{self.path}' cannot be written", "give another --output"
-        ):
+        what, remedy = f"the labels '{self.path}' cannot be written", "give another --output"
+        with reported_errors(what, remedy, OSError, ValueError):  # what else is there may be NaN
+            text = json.dumps(self.content | {"frames": frames}, indent=1, allow_nan=False)
             write_whole(self.path, text + "\n")
 
     def _frame(self, number: object) -> dict[str, Any]:

@@ -37,6 +37,8 @@ _TINY_PX = 16
 """Smaller images are parts of others."""
 _MOST_OBLONG = 2.5
 """Pixels that were put together in one direction only."""
+_MOST_COEFFICIENTS = 32
+"""Of a depth polynomial, each of which takes a pass over every image."""
 _FARTHEST_ASIDE = 1.5
 """How far the centre may lie beside the image's middle, in longer sides."""
 
@@ -131,6 +133,10 @@ class Camera:
         object.__setattr__(self, "height", int(self.height))
         object.__setattr__(self, "distortion", self._checked_distortion())
         count = np.size(self.depth_polynomial)
+        if count > _MOST_COEFFICIENTS:
+            raise ToftrackError(
+                f"the depth polynomial has {count} coefficients; give at most {_MOST_COEFFICIENTS}"
+            )
         polynomial = _numbers(self.depth_polynomial, (count,), "the depth polynomial")
         object.__setattr__(self, "depth_polynomial", tuple(map(float, polynomial)))
         if np.size(self.depth_polynomial_range_m):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -13,6 +14,9 @@ from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
+_FULL_WORD_M = 65.535
+"""What many cameras say in millimetres where there is no reading, as everywhere before a covered
+lens."""
 _MILLIMETRES = (100.0, 20_000.0)
 """A median between these is one of millimetres, unless they are centimetres."""
 _NEAREST_CM, _LARGEST_CM = (15.0, 120.0), 1000.0
@@ -138,6 +142,17 @@ class DepthImage:
     timestamp_s: float
 
 
+def checked_moment(index: Any, timestamp_s: Any) -> tuple[int, float]:
+    """A frame's number and its seconds; ToftrackError where they are no numbers."""
+    try:
+        return int(index), float(timestamp_s)
+    except (TypeError, ValueError, OverflowError):
+        raise ToftrackError(
+            f"the frame's index and timestamp_s must be a whole number and seconds, but are "
+            f"{index!r} and {timestamp_s!r}"
+        ) from None
+
+
 def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     """A depth image as (H, W) float32 metres with 0 for no reading, and (3, 3) float64 intrinsics.
 
@@ -160,11 +175,13 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
         raise wrong_unit("the depth image", depth, str(depth.dtype))
     if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
-    depth = np.ascontiguousarray(depth, np.float32)
+    with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading
+        depth = np.ascontiguousarray(depth, np.float32)
     farthest = largest_reading(depth)
     if farthest == np.inf:
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         farthest = largest_reading(depth)
-    if farthest > LARGEST_MEDIAN_M and median_reading(depth) > LARGEST_MEDIAN_M:
+    median = median_reading(depth) if farthest > LARGEST_MEDIAN_M else 0.0
+    if median > LARGEST_MEDIAN_M and not math.isclose(median, _FULL_WORD_M, rel_tol=1e-6):
         raise wrong_unit("the depth image", depth)
     return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

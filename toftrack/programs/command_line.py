@@ -26,7 +26,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_overrides
-from toftrack.configuration.sentences import FULL_ERROR, sentence
+from toftrack.configuration.sentences import FULL_ERROR, place_of, sentence
 from toftrack.errors import ToftrackError
 from toftrack.files.json_text import read_object
 from toftrack.files.safe_files import let_links_go, write_whole
@@ -78,6 +78,9 @@ def run(main: Callable[[], object]) -> int:
         shutdown.forget_streams()
         return shutdown.exit_status(end)
     except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser
+        if place := place_of(end):
+            print(f"error: a part that is not toftrack's ended it{place}", file=sys.stderr)
+            return 1
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
         return 1 if end.code else 0

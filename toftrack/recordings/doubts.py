@@ -139,7 +139,7 @@ def gaps_doubt(timestamp_s: np.ndarray) -> str:
 
 def names_doubt(names: Sequence[str]) -> str:
     """What speaks against files, in their order, being all frames there were; "" for nothing."""
-    numbers = [re.findall(r"\d+", name) for name in names]
+    numbers = [re.findall(r"[0-9]{1,18}", name) for name in names]
     changing = [of for of in zip(*numbers, strict=False) if len(set(of)) > 1]
     steps = np.diff([int(number) for number in changing[0]]) if len(changing) == 1 else np.zeros(0)
     least = steps.min(initial=10**9)

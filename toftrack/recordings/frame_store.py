@@ -55,9 +55,11 @@ def file_of(path: str | Path, suffix: str = "") -> Path:
     opened.
     """
     path, give = Path(path).expanduser(), f"give the path of a recording{suffix}"
-    if path.is_dir():
+    with reading(path):  # too long a name
+        is_folder, is_there = path.is_dir(), path.exists()
+    if is_folder:
         raise ToftrackError(f"'{path}' is a directory; {give}")
-    if not path.exists():
+    if not is_there:
         raise ToftrackError(f"there is no file '{path}'; {give}")
     with reading(path):
         check_readable(path)

@@ -30,7 +30,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.archives import broken_is_value_error
+from toftrack.files.archives import MOST_TEXT_BYTES, broken_is_value_error
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_new, open_to_read, write_whole
 from toftrack.frames.camera import Camera
@@ -58,13 +58,18 @@ class Files:
         """A file; OSError, or ValueError where it is damaged."""
         return open_to_read(self.path / name)
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, most_bytes: int | None = None) -> bytes:
         """The content of a file; ToftrackError."""
         with self.reported(f"'{name}' in {self.what}"), self.open(name) as stream:
-            content = stream.read(_MOST_BYTES + 1)
-            if len(content) > _MOST_BYTES:
-                raise ValueError("it is larger than any camera's image")
+            most = most_bytes or _MOST_BYTES
+            content = stream.read(most + 1)
+            if len(content) > most:
+                raise ValueError(f"it is larger than {most // 2**20} MB")
             return content
+
+    def text(self, name: str) -> str:
+        """The content of a text; ToftrackError, or ValueError where it is none."""
+        return self.read(name, MOST_TEXT_BYTES).decode("utf-8")
 
     def reported(self, what: str = "") -> AbstractContextManager[None]:
         what = f"{what or self.what} cannot be read"
@@ -99,9 +104,9 @@ class ZippedFiles(Files):
                 raise ValueError("its compression is not read; zip it in the usual way")
             return self._opened().open(entry)
 
-    def read(self, name: str) -> bytes:
+    def read(self, name: str, most_bytes: int | None = None) -> bytes:
         with self.reported(f"'{name}' in {self.what}"), broken_is_value_error():
-            content = super().read(name)
+            content = super().read(name, most_bytes)
             if len(content) != self._opened().getinfo(name).file_size:
                 raise ValueError("it is shorter than the archive says")
             return content
@@ -202,7 +207,7 @@ def read_image_folder(
     if found is not None:
         what = f"the camera file '{found}' in {files.what} cannot be read"
         with reported_errors(what, "write it anew (docs/formats.md)", ValueError):
-            content = parse_json(files.read(found).decode("utf-8"))
+            content = parse_json(files.text(found))
         if not isinstance(content, dict):
             raise ToftrackError(f"'{found}' in {files.what} is not a camera file")
     if camera_file is not None:
@@ -237,10 +242,8 @@ def _is_image(name: str) -> bool:
 def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
     """Depth and amplitude images, and what else there is, in words; ToftrackError where no depth is
     to be told from the rest."""
-    images = sorted(
-        (n for n in files.names if _is_image(n) and not PurePosixPath(n).name.startswith(".")),
-        key=_order,
-    )
+    images = [n for n in files.names if _is_image(n) and not PurePosixPath(n).name.startswith(".")]
+    images = sorted(sorted(images), key=_order)
     grey = [name for name in images if not _surely_no_depth(files, name)]
     amplitude = [n for n in grey if PurePosixPath(n).name.lower().startswith("amplitude")]
     depth = [name for name in grey if name not in set(amplitude)]
@@ -363,10 +366,11 @@ def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
     if path is None:
         return None
     what, remedy = f"'{path}' in {files.what} cannot be read", "it must be one number a line"
-    with reported_errors(what, remedy, ValueError):
-        times = np.array([float(word) for word in files.read(path).decode("utf-8").split()])
     count = len(depth)
-    if len(times) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
+    with reported_errors(what, remedy, ValueError):
+        words = files.text(path).split(maxsplit=count)
+        times = np.array([float(word) for word in words[:count]])
+    if len(words) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
         raise ToftrackError(
             f"'{path}' in {files.what} must hold {count} finite times, one for each depth image, "
             "that do not go backwards; repair or remove it"
@@ -376,5 +380,6 @@ def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
 
 def _order(name: str) -> list[tuple[int, int, str]]:
     """Sorts names with numbers in them by value: 2 before 10."""
-    parts = re.findall(r"\d+|\D+", name)
-    return [(0, int(p), p) if p.isdecimal() else (1, 0, p) for p in parts]
+    # By length, then by digits: Python makes no numbers of thousands of them.
+    parts = re.findall(r"0*([0-9]+)|([^0-9]+)", name)
+    return [(0, len(digits), digits) if digits else (1, 0, other) for digits, other in parts]

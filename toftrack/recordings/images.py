@@ -171,11 +171,14 @@ def _decoded_exr(content: bytes) -> np.ndarray:
     # Not by its older InputFile, which damaged files crash.
     library = module_of_extra("OpenEXR", "EXR images are read by OpenEXR", "exr")
     try:
-        header = library.File(io.BytesIO(content), header_only=True).header()
-        low, high = header["dataWindow"]
-        width, height = (int(value) for value in high.astype(np.int64) - low + 1)
-        if min(width, height) < 1 or width * height > LARGEST_PIXELS:
-            raise ValueError("it is damaged, or larger than any camera's image")
+        parts = library.File(io.BytesIO(content), header_only=True).parts
+        values = 0  # the library decodes all channels of all parts
+        for part in reversed(parts):
+            low, high = part.header["dataWindow"]
+            width, height = (int(value) for value in high.astype(np.int64) - low + 1)
+            values += width * height * len(part.header["channels"])
+            if min(width, height) < 1 or values > LARGEST_PIXELS:
+                raise ValueError("it is damaged, or larger than any camera's image")
         channels = library.File(io.BytesIO(content), separate_channels=True).channels()
         read = [channels[name].pixels for name in _depth_channels(list(channels))]
     except (OSError, RuntimeError, TypeError, KeyError, MemoryError) as error:

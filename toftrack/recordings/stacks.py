@@ -7,8 +7,6 @@ the camera, where it tells another size of the images, decides.
 from __future__ import annotations
 
 import math
-import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,16 +16,18 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, module_of_extra
-from toftrack.files.archives import MOST_BYTES
 from toftrack.files.safe_files import open_to_read
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_metres, size_of
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 from toftrack.recordings.images import pages_of
+from toftrack.recordings.matlab import matlab_variables, read_matlab
 
 _PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
 """Which axes are frames, rows and columns; the last is MATLAB's as HDF5 sees it."""
-_COMPRESSED = 15
-"""Of the kinds of elements in a `.mat`."""
+_NUMBERS = ("double", "single", *(f"{s}int{n}" for s in ("", "u") for n in (8, 16, 32, 64)))
+"""MATLAB's classes of numbers."""
+_MOST_NESTED = 32
+"""Groups of HDF5: each is looked up from the first one on."""
 _MOST_RATIO, _SMALL_BYTES, _MOST_CHUNK_BYTES = 1000, 2**26, 2**28
 """As in `archives`: what shrank more was made to fill memories."""
 
@@ -109,7 +109,7 @@ def _reported(path: Path, what: str = "") -> Iterator[None]:
 
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
     with _reported(path):
-        images = np.load(path, mmap_mode="r", allow_pickle=False)
+        images = np.lib.format.open_memmap(path, mode="r")
     return (images[None] if images.ndim == 2 else images), _PYTHONS
 
 
@@ -154,6 +154,8 @@ class _Hdf5:
         there: dict[str, Any] = {}
 
         def note(name: str, found: Any) -> None:
+            if name.count("/") > _MOST_NESTED:
+                raise ValueError("its groups are nested too deeply")
             # Hard links only: nothing outside of this file is opened.
             if isinstance(found, self._h5py.Dataset) and not (found.is_virtual or found.external):
                 if found.dtype.kind in "uif" and len(found.shape or ()) in (2, 3):
@@ -192,38 +194,14 @@ def _mat(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
     with reading(path), open_to_read(path) as stream:
         if stream.read(10) == b"MATLAB 7.3":
             return _hdf5(path, wanted)
-    from scipy.io import loadmat, whosmat
-
     with _reported(path):
-        _check_unpacked(path)
-        numbers = ("double", "single", *(f"{s}int{n}" for s in ("", "u") for n in (8, 16, 32, 64)))
         there = {
             name: shape
-            for name, shape, kind in whosmat(str(path))
-            if kind in numbers and len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
+            for name, (shape, kind) in matlab_variables(path).items()
+            if kind in _NUMBERS and len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
         }
-        name = _chosen(path, wanted, there)
-        if 8 * math.prod(there[name]) > MOST_BYTES:
-            raise ValueError("it is larger than a gigabyte: save it with -v7.3")
-        images = np.asarray(loadmat(str(path), variable_names=[name])[name])
+        images = read_matlab(path, _chosen(path, wanted, there))
     return (images[None], _PYTHONS) if images.ndim == 2 else (images, _MATLABS)
-
-
-def _check_unpacked(path: Path) -> None:
-    """ValueError where a compressed variable is larger than anything that is read: SciPy makes
-    room for what its header claims."""
-    with open_to_read(path) as stream:
-        order = "<" if stream.read(128)[126:] == b"IM" else ">"
-        while len(tag := stream.read(8)) == 8:
-            kind, size = struct.unpack(order + "II", tag)
-            end, unpacked, unpack = stream.tell() + size, 0, zlib.decompressobj()
-            while kind == _COMPRESSED and (piece := stream.read(min(2**20, end - stream.tell()))):
-                while piece:
-                    unpacked += len(unpack.decompress(piece, 2**20))
-                    piece = unpack.unconsumed_tail
-                if unpacked > MOST_BYTES:
-                    raise ValueError("a variable is larger than a gigabyte: save it with -v7.3")
-            stream.seek(end)
 
 
 _OPENED = {

@@ -84,13 +84,15 @@ def open_recording(
     """
     path = Path(path).expanduser()
     suffix = path.suffix.lower()
+    with reading(path):  # too long a name
+        is_folder = path.is_dir()
     if is_bag(path):
         return read_rosbag(path, topic, camera_file, bare.unit_m)
     if topic is not None:
         raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {topic}; leave it out")
     if bare.dataset is not None and suffix not in DATASETS:
         raise ToftrackError(f"'{path}' has no dataset {bare.dataset}; leave device.dataset out")
-    if path.is_dir() or suffix == ".zip":
+    if is_folder or suffix == ".zip":
         return read_image_folder(path, camera_file, bare)
     if suffix == ".srs":
         return read_srs(path, modulation_mhz)

@@ -28,6 +28,11 @@ from toftrack.recordings.frame_store import FrameStore, file_of, rate_of
 VIDEOS = frozenset(".mkv .avi .mov .mp4 .m4v .webm .mpg .mpeg .wmv .nut".split())
 """How the names of videos end."""
 _GREY = ("gray16le", "gray16be")
+_ONLY_THIS_FILE = {
+    "format_whitelist": "matroska,webm,avi,mov,mpeg,mpegvideo,asf,nut",
+    "protocol_whitelist": "file",
+}
+"""FFmpeg goes by the content: lists of files and addresses, whatever they are called, are none."""
 _MISSING_FRAMES = 5  # fewer at the end say nothing of a file that was cut off
 
 
@@ -145,7 +150,7 @@ def _opened(path: Path) -> Any:
     remedy = "it is damaged, cut off or of another kind"
     with reported_errors(f"'{path}' cannot be read as a video", remedy, *_errors()):
         # A damaged text among the tags is no reason to refuse the images.
-        return av.open(str(path), metadata_errors="replace")
+        return av.open(str(path), metadata_errors="replace", options=_ONLY_THIS_FILE)
 
 
 def _errors() -> tuple[type[Exception], ...]:

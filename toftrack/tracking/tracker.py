@@ -14,7 +14,7 @@ from toftrack.compute.quality import Pace, Timekeeper
 from toftrack.compute.threads import at_most, small_operations
 from toftrack.errors import MOST_HANDS, ToftrackError, check_number
 from toftrack.frames.estimate import Estimate
-from toftrack.frames.frame import DepthImage, checked_image
+from toftrack.frames.frame import DepthImage, checked_image, checked_moment
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
@@ -82,7 +82,7 @@ class HandsTracker:
         depth_m, k = checked_image(depth_m, k)
         index = self.state.next_index if index is None else index
         timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
-        image = DepthImage(depth_m, k, index, timestamp_s)
+        image = DepthImage(depth_m, k, *checked_moment(index, timestamp_s))
         with at_most(quality.threads):
             model = self.model.at_quality(quality)
             self.state, self.infos, estimates = _step(self.state, image, model)
