@@ -85,7 +85,7 @@ def _one_line(text: str) -> str:
 
 def _of_system(error: OSError) -> str:
     reason = error.strerror or _one_line(str(error)) or type(error).__name__
-    if error.filename is None and (place := _place(error)):  # as of a camera that is gone
+    if error.filename is None and (place := place_of(error)):  # as of a camera that is gone
         return f"{reason}{place} ({FULL_ERROR}=1 shows the traceback)"
     if error.filename is None:
         return f"{reason}; free what is needed, or choose another folder with hydra.run.dir=DIR"
