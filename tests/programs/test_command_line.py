@@ -21,6 +21,7 @@ import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 from toftrack.output.files import own_folder
+from toftrack.programs import command_line
 from toftrack.programs.command_line import FailedJobs, run
 
 pytestmark = pytest.mark.usefixtures("hangups_are_handled")
@@ -276,7 +277,11 @@ def test_environment_is_as_before_after_a_run(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize(("code", "status"), [(None, 0), (0, 0), (1, 1), (2, 1), ("text", 1)])
-def test_exit_requests_keep_to_the_promised_statuses(code: object, status: int) -> None:
+def test_exit_requests_keep_to_the_promised_statuses(
+    code: object, status: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(command_line, "place_of", lambda _: "")  # as if Hydra's were asked for
+
     def main() -> None:
         raise SystemExit(code)
 
