@@ -266,7 +266,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Does anything grow in a long live run?")
     parser.add_argument("--minutes", type=float, default=20.0, help="how long; 20 if not given")
     parser.add_argument("--stream", choices=STREAMS, default=STREAMS[0], help="udp if not given")
-    parser.add_argument("--hands", type=int, choices=(1, 2), default=1, help="1 if not given")
+    parser.add_argument("--hands", type=int, choices=(1, 2, 4), default=1, help="1 if not given")
     parser.add_argument("--source", type=Path, help="what the camera sees; the sample if not given")
     given = parser.parse_args()
     overrides = [f"hands={given.hands}"]
