@@ -224,7 +224,7 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
     """See rigid.compose; on the CPU, in float32."""
     left, right = _rows(reference), _rows(tangent)
-    out = np.empty((max(len(left), len(right)), left.shape[1]), np.float32)
+    out = np.empty(np.broadcast_shapes(left.shape, right.shape), np.float32)
     compose_rows(left, right, _PIVOT, out)
     return torch.from_numpy(out)
 
