@@ -138,7 +138,9 @@ def test_joints_out_of_sight_are_counted() -> None:
 # What is thought of it.
 
 PLAIN = replace(
-    confidence_model(memory=0.0, believe=0.6, confidence=0.3, give_up=0.1, whole=0.0),
+    confidence_model(
+        memory=0.0, believe=0.6, believe_frames=1, confidence=0.3, give_up=0.1, whole=0.0
+    ),
     log_odds=LogOdds(0.0, {"log_score": 1.0}),
     whole_odds=LogOdds(0.0, {}),
 )
@@ -198,6 +200,29 @@ def test_a_new_hand_is_asked_for_more_confidence_than_one_that_was_believed(
     status = judged(followed(confirmed=confirmed), chance)
     assert status.lost == lost and status.confidence == pytest.approx(chance)
     assert (status.state_name == "tracking") == (not lost)
+
+
+@pytest.mark.parametrize(
+    ("chances", "dt_s", "lost"),
+    [
+        ([0.5, 0.5, 0.5], FRAME_S, [True, True, False]),
+        ([0.5, 0.5, 0.3, 0.5, 0.5, 0.5], FRAME_S, [True] * 5 + [False]),
+        ([0.3, 0.7, 0.3], FRAME_S, [True, False, False]),  # believed at once, and from then on
+        ([0.5] * 5, FRAME_S / 2, [True] * 4 + [False]),  # 1 + 4 halves
+        ([0.5] * 3, 0.5, [True, True, False]),  # what was dropped was not likely
+        ([0.3] * 9, FRAME_S, [True] * 9),
+    ],
+)
+def test_a_new_hand_is_believed_where_it_is_sure_or_stays_likely(
+    chances: list[float], dt_s: float, lost: list[bool]
+) -> None:
+    model = replace(PLAIN, believe=0.4, believe_frames=3, believe_at_once=0.6, confidence=0.2)
+    track, found = followed(confirmed=False), []
+    for chance in chances:
+        status = judged(track, chance, dt_s, model)
+        found.append(status.lost)
+        track = replace(track, likely=status.likely, confirmed=track.confirmed or not status.lost)
+    assert found == lost
 
 
 def test_a_hand_that_is_wrong_as_a_whole_is_flagged_however_sure_its_joints_are() -> None:

@@ -327,7 +327,9 @@ class ConfidenceModel:
     """When an estimate is lost, and when its track ends; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time.
+    believe: likewise, until a track was believed for the first time: for that it must be reached for
+        `believe_frames` frames in a row, as SORT's min_hits (Bewley et al., ICIP 2016).
+    believe_at_once: a new track that reaches this is believed in that frame.
     give_up: below this, a frame is bad.  patience: bad frames in a row that end a track; 0 = none.
     whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
         as well: a hand taken for another one, or turned round, is not to be used at all, while one
@@ -340,6 +342,8 @@ class ConfidenceModel:
 
     confidence: float
     believe: float
+    believe_at_once: float
+    believe_frames: int
     give_up: float
     patience: int
     memory: float
@@ -350,8 +354,10 @@ class ConfidenceModel:
     joints: JointConfidence
 
     def __post_init__(self) -> None:
-        for name in ("confidence", "believe", "whole", "give_up", "joint_ok"):
+        shares = ("confidence", "believe", "believe_at_once", "whole", "give_up", "joint_ok")
+        for name in shares:
             check_number(f"lost.{name}", getattr(self, name), 0, 1)
+        check_number("lost.believe_frames", self.believe_frames, 1, whole=True)
         check_number("lost.memory", self.memory, 0, 0.99)
         check_number("lost.patience", self.patience, 0, whole=True)
 
@@ -386,7 +392,7 @@ class Status:
     state_name, lost: as Estimate has them.
     confidence: probability that every joint is within 40 mm; NaN where nothing says.
     log_odds: the same, smoothed over time.  whole_odds: likewise of the mean joint error.
-    doubtful: as Track has it, with this frame.
+    likely, doubtful: as Track has them, with this frame.
     """
 
     state_name: str
@@ -394,6 +400,7 @@ class Status:
     confidence: float = math.nan
     log_odds: float = 0.0
     whole_odds: float = 0.0
+    likely: Duration = Duration()
     doubtful: Duration = Duration()
 
 
@@ -409,10 +416,12 @@ def judge(
     passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
     doubtful = Duration(track.doubtful.seconds + passed)
     doubtful = doubtful if confidence < model.give_up else Duration()
-    confirmed = track.confirmed or confidence >= model.believe
+    likely = track.likely.extended(dt_s, FRAME_S) if confidence >= model.believe else Duration()
+    at_once = confidence >= model.believe_at_once
+    confirmed = track.confirmed or at_once or likely.reached(model.believe_frames)
     lost = not confirmed or confidence < model.confidence or probable < model.whole
     name = _state_name(features) if lost else "tracking"
-    return Status(name, lost, confidence, smooth, whole, doubtful)
+    return Status(name, lost, confidence, smooth, whole, likely, doubtful)
 
 
 def probability(log_odds: float) -> float:

@@ -75,7 +75,8 @@ class Track:
     pose: (1, 27) the last estimate; at the start, what the track begins with.
     trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
     number: unique.  side: right or left, with the `evidence`.
-    age: since it began or restarted.  doubtful: how long it was below ConfidenceModel.give_up.
+    age: since it began or restarted.
+    likely, doubtful: how long it reached ConfidenceModel.believe, and was below its give_up.
     log_odds: that every joint of the estimate is within 40 mm, smoothed over time.
     whole_odds: that its mean error is, likewise.
     confirmed: one of its estimates was believed; until then the track is tentative.
@@ -95,6 +96,7 @@ class Track:
     evidence: SideEvidence = SideEvidence()
     shape: ShapeEstimate = field(default_factory=first_shape)
     age: Duration = Duration()
+    likely: Duration = Duration()
     doubtful: Duration = Duration()
     log_odds: float = 0.0
     whole_odds: float = 0.0

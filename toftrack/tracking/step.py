@@ -139,7 +139,9 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         pose, moved = select(propose(view, model.decode(filtered.mean)), view.hidden)
     if moved:
         fresh = new_track(pose, model)
-        track = changed(track, age=fresh.age, doubtful=fresh.doubtful, trend=fresh.trend)
+        track = changed(
+            track, age=fresh.age, likely=fresh.likely, doubtful=fresh.doubtful, trend=fresh.trend
+        )
     elif refines:
         pose, trend = steadied(pose, track.pose, track.trend, dt_s, motions)
         track = changed(track, trend=trend)
@@ -158,6 +160,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         pose=pose,
         shape=learn_shape(view, pose) if believed else track.shape,
         age=track.age.extended(dt_s),
+        likely=status.likely,
         doubtful=status.doubtful,
         log_odds=status.log_odds,
         whole_odds=status.whole_odds,
