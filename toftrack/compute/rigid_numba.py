@@ -85,6 +85,13 @@ def turned(q, x, y, z):
 
 
 @compiled
+def distance(a, b):
+    """Of two points (3,)."""
+    x, y, z = np.float64(a[0]) - b[0], np.float64(a[1]) - b[1], np.float64(a[2]) - b[2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@compiled
 def _moved(r, t, pivot, out):
     """One row of compose_rows."""
     before = quaternion(np.float64(r[3]), np.float64(r[4]), np.float64(r[5]))

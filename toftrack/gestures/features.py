@@ -17,6 +17,8 @@ import math
 import numpy as np
 import torch
 
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import distance
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, JOINT_NAMES, forward_kinematics
 
@@ -38,6 +40,7 @@ _DISTANCES = (_THUMB_TIP, _LITTLE), (_THUMB_TIP, _INDEX_TIP), (_INDEX_TIP, _MIDD
 
 SUMS = np.zeros((REACH, len(ANGLE_NAMES)))
 """(10, 21): what is added up of the angles."""
+_EVERY_JOINT = np.ones(len(JOINT_NAMES), bool)
 _JOINTS = np.zeros((COUNT, len(JOINT_NAMES)), bool)
 """(13, 21): of which joints each feature speaks."""
 SUMS[THUMB_ABDUCTION, 0] = 1.0
@@ -55,20 +58,34 @@ RANGES = np.append(np.abs(SUMS) @ np.diff(ANGLE_LIMITS)[:, 0], _DISTANCE_RANGES)
 """(13,) rad and palm lengths, from the least to the largest value within the joint limits."""
 
 
-def known_features(joint_ok: np.ndarray) -> np.ndarray:
-    """(13,) bool: the features all of whose joints are ok.  joint_ok: (21,) bool."""
-    known: np.ndarray = ~(_JOINTS & ~joint_ok).any(1)
-    return known
+def features(
+    angles_rad: np.ndarray, joints_m: np.ndarray, joint_ok: np.ndarray | None = None
+) -> np.ndarray:
+    """(13,) of one hand: rad, and palm lengths; NaN where one of a feature's joints is not ok.
 
-
-def features(angles_rad: np.ndarray, joints_m: np.ndarray) -> np.ndarray:
-    """(13,) of one hand: rad, and palm lengths.
-
-    angles_rad: (21,).  joints_m: (21, 3) of the same pose, in any frame.
+    angles_rad: (21,) float64.  joints_m: (21, 3) float64 of the same pose, in any frame.
+    joint_ok: (21,) bool; None = all are.
     """
-    palm = float(np.linalg.norm(joints_m[_MIDDLE] - joints_m[_WRIST]))
-    distances = [np.linalg.norm(joints_m[a] - joints_m[b]) / palm for a, b in _DISTANCES]
-    return np.append(SUMS @ angles_rad, distances)
+    values = np.empty(COUNT)
+    describe(angles_rad, joints_m, _EVERY_JOINT if joint_ok is None else joint_ok, values)
+    return values
+
+
+@entry_point
+def describe(angles, joints, ok, values):
+    """See features; into `values` (13,)."""
+    for n in range(REACH):
+        values[n] = 0.0
+        for i in range(len(angles)):
+            values[n] += SUMS[n, i] * angles[i]
+    palm = distance(joints[_MIDDLE], joints[_WRIST])
+    for n in range(len(_DISTANCES)):
+        first, second = _DISTANCES[n]
+        values[REACH + n] = distance(joints[first], joints[second]) / palm
+    for n in range(len(values)):
+        for joint in range(len(joints)):
+            if _JOINTS[n, joint] and not ok[joint]:
+                values[n] = np.nan
 
 
 def features_of_angles(angles_rad: np.ndarray) -> np.ndarray:

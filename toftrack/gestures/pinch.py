@@ -13,16 +13,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import distance
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.hand.surface import hand_surface
 
 _THUMB, _INDEX = (JOINT_NAMES.index(n) for n in ("thumb_tip", "index_tip"))
+_MIDDLE = JOINT_NAMES.index("middle_mcp")
 _LAST_BONES = 3, 6
 """Frames of the last bones of thumb and index finger, see hand.skeleton.HandPose."""
 _ENDS = [_THUMB - 1, _THUMB, _INDEX - 1, _INDEX]
-_MIDDLE_FINGER = [JOINT_NAMES.index("wrist"), *range(9, 13)]
 
 
 @dataclass(frozen=True)
@@ -74,13 +76,21 @@ def tip_gap(joints_m: np.ndarray) -> float:
 
     joints_m: (21, 3) metres.
     """
-    length = float(np.linalg.norm(np.diff(joints_m[_MIDDLE_FINGER], axis=0), axis=1).sum())
-    radii = _tip_radii()
-    ends = []
-    for tip, radius in zip((_THUMB, _INDEX), radii, strict=True):
-        way = joints_m[tip] - joints_m[tip - 1]
-        ends.append(joints_m[tip] - radius * length * way / np.linalg.norm(way))
-    return float(np.linalg.norm(ends[0] - ends[1])) / length - sum(radii)
+    return float(gap_between(joints_m, *_tip_radii()))
+
+
+@entry_point
+def gap_between(joints, thumb, index):
+    """See tip_gap; of the radii of thumb tip and index tip, in lengths of the hand."""
+    length = distance(joints[0], joints[_MIDDLE])
+    for joint in range(_MIDDLE, _MIDDLE + 3):
+        length += distance(joints[joint], joints[joint + 1])
+    ends = np.empty((2, 3))
+    for n, tip, radius in ((0, _THUMB, thumb), (1, _INDEX, index)):
+        part = radius * length / distance(joints[tip], joints[tip - 1])
+        for i in range(3):
+            ends[n, i] = joints[tip, i] - part * (joints[tip, i] - joints[tip - 1, i])
+    return distance(ends[0], ends[1]) / length - thumb - index
 
 
 def pinch_of(

@@ -20,6 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
+from toftrack.compute.compiling import entry_point
 from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.gestures import features
@@ -36,9 +37,7 @@ FLEXION_RAD, _SPLIT_RAD, _THUMB_RAD, _TIPS_PALMS = 0.44, 0.60, 0.20, 0.12
 """How far out of a gesture's range may be: a finger's total flexion, of which palm and fist are 4
 apart; its split between the knuckle and the outer joints; the thumb's abduction; and, in palm
 lengths, where the tips are: a thumb folded in and one stretched away are 0.4 apart."""
-_WIDTHS = np.repeat(
-    (_THUMB_RAD, FLEXION_RAD, FLEXION_RAD, _SPLIT_RAD, _TIPS_PALMS), (1, 1, 4, 4, 3)
-)
+WIDTHS = np.repeat((_THUMB_RAD, FLEXION_RAD, FLEXION_RAD, _SPLIT_RAD, _TIPS_PALMS), (1, 1, 4, 4, 3))
 """(13,) standard deviations of the features' tails."""
 _DOUBTFUL_SCORE, _SURE_SCORE = 0.5, 0.75
 """A frame of that score, or confidence where that is higher, says nothing; and all it can."""
@@ -88,17 +87,16 @@ class Gestures:
         classes are equally probable.  off_rad: rms distance of the angles from the pose space; NaN
         says nothing.
         """
-        cfg, log_poses = self.settings, self._log_densities(values)
+        cfg, near = self.settings, 0.0
         if cfg.off_rad is not None and math.isfinite(off_rad):
             near = math.log(_OFF_RANGE_RAD * 2 / (cfg.off_rad * math.sqrt(2 * math.pi)))
-            log_poses += np.where(self.own, 0.0, near - 0.5 * (off_rad / cfg.off_rad) ** 2)
-        log_poses = np.append(log_poses, 0.0)
-        log_classes = np.logaddexp.reduce(log_poses + self._tables[1], axis=1)
-        log_classes[-1] += math.log(cfg.other)
+            near -= 0.5 * (off_rad / cfg.off_rad) ** 2
         trust = (score - _DOUBTFUL_SCORE) / (_SURE_SCORE - _DOUBTFUL_SCORE)
-        log_classes *= min(max(trust, 0.0), 1.0)
-        parts: np.ndarray = np.exp(log_classes - log_classes.max())
-        return parts / parts.sum()
+        trust = min(max(trust, 0.0), 1.0)
+        log_poses, found = self._log_densities(values), np.empty(len(self.names))
+        log_poses[~self.own] += near
+        class_probabilities(log_poses, self.classes, math.log(cfg.other), trust, found)
+        return found
 
     def decided(self, label: str, values: np.ndarray) -> bool:
         """Whether all is known that makes a hand's pose this class: of its definition that suits
@@ -113,21 +111,50 @@ class Gestures:
 
     def _log_densities(self, values: np.ndarray) -> np.ndarray:
         """(M,) of the values (13,), in parts of the uniform density of "other"."""
-        most, _ = self._tables
-        beyond = np.maximum(np.maximum(self.low - values, values - self.high), 0.0) / _WIDTHS
-        return np.nansum(most - 0.5 * beyond**2, axis=1)
+        found = np.empty(len(self.low))
+        log_densities(values, self.low, self.high, self._most, found)
+        return found
 
     @cached_property
-    def _tables(self) -> tuple[np.ndarray, np.ndarray]:
-        """Log densities (M, 13) within the ranges, and of each class (C, M + 1)
-        which definitions it is: minus the log of their number, or -inf. "other" comes last.
-        """
-        extent = self.high - self.low + _WIDTHS * math.sqrt(2 * math.pi)
-        most = np.log(np.maximum(features.RANGES, extent) / extent)
-        count = len(self.names)
-        own = np.append(self.classes, count - 1) == np.arange(count)[:, None]
-        with np.errstate(divide="ignore"):
-            return most, np.log(own / own.sum(1, keepdims=True))
+    def _most(self) -> np.ndarray:
+        """(M, 13) likewise within the ranges."""
+        extent = self.high - self.low + WIDTHS * math.sqrt(2 * math.pi)
+        return np.log(np.maximum(features.RANGES, extent) / extent)
+
+
+@entry_point
+def log_densities(values, low, high, most, found):
+    """See Gestures._log_densities; into `found` (M,)."""
+    for m in range(len(found)):
+        found[m] = 0.0
+        for n in range(len(values)):
+            said = most[m, n]
+            if not (math.isnan(said) or math.isnan(values[n])):
+                beyond = max(low[m, n] - values[n], values[n] - high[m, n], 0.0) / WIDTHS[n]
+                found[m] += said - 0.5 * beyond * beyond
+
+
+@entry_point
+def class_probabilities(log_poses, classes, other, trust, found):
+    """Of classes, into `found` (C,); that of "other", the last one, has a pose of density 1, too.
+
+    log_poses: (M,) log densities of the definitions' poses.  classes: (M,) theirs.
+    other: log prior weight of "other".  trust: 0 .. 1, what the frame counts.
+    """
+    last, most = len(found) - 1, np.full(len(found), -np.inf)
+    number, total = np.zeros(len(found)), np.zeros(len(found))
+    most[last], number[last] = 0.0, 1.0
+    for m in range(len(classes)):
+        most[classes[m]] = max(most[classes[m]], log_poses[m])
+        number[classes[m]] += 1
+    total[last] = math.exp(-most[last])
+    for m in range(len(classes)):
+        total[classes[m]] += math.exp(log_poses[m] - most[classes[m]])
+    for c in range(len(found)):
+        mean = most[c] + math.log(total[c] / number[c])
+        found[c] = trust * (mean + (other if c == last else 0.0))
+    found[:] = np.exp(found - found.max())
+    found[:] = found / found.sum()
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,7 +185,7 @@ def no_gestures() -> None:
 def definition_of(pose: NamedPose) -> Definition:
     """A user's pose as ranges: a tail's width and its spread to both sides."""
     values = features.features_of_angles(pose.angles_rad)
-    half = _WIDTHS.copy()
+    half = WIDTHS.copy()
     half[: len(features.SUMS)] += np.sqrt(features.SUMS**2 @ pose.spread_rad**2)
     return Definition(pose.name, values - half, values + half)
 
@@ -213,7 +240,7 @@ def _alike(gestures: Gestures, own: int, other: int) -> bool:
     thumb = [features.THUMB_ABDUCTION, features.THUMB_FLEXION, features.REACH, features.GAP]
     said = np.column_stack((known[:, features.FLEXION], known[:, thumb].any(1)))
     more = said[0] & ~said[1] if not gestures.own[other] else said[0] != said[1]
-    apart = np.maximum(np.maximum(low[1] - value, value - high[1]), 0) / _WIDTHS
+    apart = np.maximum(np.maximum(low[1] - value, value - high[1]), 0) / WIDTHS
     return not more.any() and bool((apart[known.all(0)] < 1).all())
 
 
@@ -296,8 +323,7 @@ def tell_gesture(
     joints = estimate.joints_m.astype(np.float64)
     # Which fingers are straight is told by joints that are less exact than who uses a joint wants.
     asked = estimate.joint_ok | (estimate.joint_confidence >= _JOINT)
-    known = features.known_features(asked)
-    values = np.where(known, features.features(angles, joints), np.nan)
+    values = features.features(angles, joints, asked)
     # Of a hand on a table much of the image is not explained, and the pose is right all the same.
     score = float(np.fmax(estimate.score, estimate.confidence))
     state, label, probability = update(state, values, score, off_rad, gestures, frames)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import distance
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.hand.surface import BONE_RADII_MM
 
@@ -54,8 +53,8 @@ def _add_overlaps(joints, ratio, out):
             knuckle = 1 + 4 * finger
             length = chord = 0.0
             for bone in range(3):
-                length += _distance(joints[n, knuckle + bone], joints[n, knuckle + bone + 1])
-            chord = _distance(joints[n, knuckle], joints[n, knuckle + 3])
+                length += distance(joints[n, knuckle + bone], joints[n, knuckle + bone + 1])
+            chord = distance(joints[n, knuckle], joints[n, knuckle + 3])
             part = (chord / max(length, 1e-9) - BENT) / (STRAIGHT - BENT)
             straight[finger] = min(max(part, 0.0), 1.0)
             for end in range(3):
@@ -75,18 +74,12 @@ def _add_overlaps(joints, ratio, out):
                     depth = 0.0
                     for b in range(5):
                         apart = (_RADII_M[first, a] + _RADII_M[second, b]) * share
-                        gap = _distance(points[first, a], points[second, b])
+                        gap = distance(points[first, a], points[second, b])
                         depth = max(depth, 1 - gap / apart)
                     found += depth * depth
                 found *= 1 + (STRICT - 1) * either
                 out[n, first] += found
                 out[n, second] += found
-
-
-@compiled
-def _distance(a, b):
-    x, y, z = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-    return math.sqrt(x * x + y * y + z * z)
 
 
 _RADII_M = np.array(RADII_MM) / 1e3

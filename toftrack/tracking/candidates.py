@@ -91,7 +91,8 @@ class View:
             return False
         seen, joints = self.observation, self.fitted.refiner.joints(self.track.pose)[0]
         hiding_m = seen.depth_m * seen.occluder  # not another hand: the networks know both apart
-        return out_of_sight(joints, hiding_m, seen.k)[1] > _COVERED
+        hidden: float = out_of_sight(joints.numpy(), hiding_m.numpy(), seen.k.double().numpy())[1]
+        return hidden > _COVERED
 
     @cached_property
     def keypoints(self) -> Keypoints:

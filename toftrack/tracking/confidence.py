@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from torch import Tensor
 
-from toftrack.compute.compiling import entry_point
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.pace import FRAME_S, Duration
+from toftrack.compute.rigid_numba import distance
 from toftrack.detector.hand_detector import Detection
 from toftrack.errors import ToftrackError, check_number
 from toftrack.files.json_text import read_json
@@ -92,25 +93,45 @@ def confidence_features(
     """
     if detection.empty:
         return replace(last, log_score=math.log(max(score, _LEAST)))
-    at = joints_m.numpy()
-    keypoints = np.linalg.norm(at - detection.keypoints.points_m.numpy(), axis=1)
-    off = np.linalg.norm(at - detection.joints_m.numpy(), axis=-1).mean(1)
+    keypoints, k = detection.keypoints, observation.k.double().numpy()
+    off = np.empty(len(detection.joints_m))
+    known_m, sigma_m = keypoints.points_m.numpy(), keypoints.sigma_m.numpy()
+    hypotheses_m, depth_m = detection.joints_m.numpy(), observation.depth_m.numpy()
+    mean_m, most_m, unsure_m, unseen, hidden = compare_joints(
+        joints_m.numpy(), known_m, sigma_m, hypotheses_m, depth_m, k, off
+    )
     likely = off[detection.log_probability.numpy() > math.log(_LIKELY)]
-    unseen, hidden = out_of_sight(joints_m, observation.depth_m, observation.k)
     return ConfidenceFeatures(
         log_score=math.log(max(score, _LEAST)),
-        keypoints_off=_log_cm(float(keypoints.mean())),
-        farthest_keypoint_off=_log_cm(float(keypoints.max())),
-        pose_off=_log_cm(float(likely.min()) if len(likely) else float(off.min())),
+        keypoints_off=_log_cm(mean_m),
+        farthest_keypoint_off=_log_cm(most_m),
+        pose_off=_log_cm(float(likely.min() if len(likely) else off.min())),
         likeliest_off=_log_cm(float(off[0])),
         expected_error=_log_cm(float(detection.error_m[0])),
-        unsure=_log_cm(float(detection.keypoints.sigma_m.numpy().mean())),
+        unsure=_log_cm(unsure_m),
         absent=_surprise(detection.present),
         other_side=_surprise(detection.right_side),
         unseen=unseen,
         hidden=hidden,
         young=1 / (1 + age_s / FRAME_S),
     )
+
+
+@entry_point
+def compare_joints(joints, keypoints, sigma, hypotheses, depth, k, off):
+    """Of joints (21, 3): mean and largest distance from keypoints, the keypoints' mean deviation,
+    and the shares that are out of sight; their mean distances from hypotheses into `off` (H,).
+    """
+    mean = most = unsure = 0.0
+    for n in range(len(joints)):
+        away = distance(joints[n], keypoints[n])
+        mean, most, unsure = mean + away, max(most, away), unsure + sigma[n]
+    for h in range(len(hypotheses)):
+        off[h] = 0.0
+        for n in range(len(joints)):
+            off[h] += distance(joints[n], hypotheses[h, n]) / len(joints)
+    outside, behind = sight(joints, depth, k)
+    return mean / len(joints), most, unsure / len(joints), outside, behind
 
 
 def log_odds(probability: float) -> float:
@@ -122,55 +143,42 @@ def _log_cm(metres: float) -> float:
     return math.log(max(100 * metres, 0.05))
 
 
-def _log_cm_of(*columns_m: np.ndarray) -> np.ndarray:
-    """(N, columns) logs of centimetres, of columns (N,) of metres."""
-    values: np.ndarray = np.log(np.maximum(100 * np.stack(columns_m, 1), 0.05))
-    return values
+log_cm = compiled(_log_cm)
+"""The same for kernels."""
 
 
 def _surprise(probability: float) -> float:
     return -math.log(min(max(probability, _LEAST), 1.0))
 
 
-def out_of_sight(joints: Tensor, depth_m: Tensor, k: Tensor) -> tuple[float, float]:
-    """The shares of joints (21, 3) outside of the image (H, W), and of those behind something."""
-    at, seen = joints.double().numpy(), np.empty((len(joints), 1))
-    read_around(at, depth_m.numpy(), k.double().numpy(), 0.0, seen)
-    behind = (seen[:, 0] > 0) & (seen[:, 0] < np.maximum(at[:, 2], _NEAREST_M) - _BEHIND_M)
-    return float(np.isnan(seen).mean()), float(behind.mean())
-
-
-def _seen_around(joints_m: np.ndarray, depth_m: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """(N, 3) of joints (N, 3): shares of 3 x 3 readings about each that are outside and without
-    reading, and their median depth or NaN.
-    """
-    seen = np.empty((len(joints_m), 9))
-    read_around(joints_m, depth_m, k, _AROUND_M, seen)
-    outside, unread = np.isnan(seen), seen == 0
-    count = (seen > 0).sum(1)
-    ordered = np.sort(np.where(seen > 0, seen, np.inf), 1)  # the lower middle is the median
-    median = ordered[np.arange(len(count)), np.maximum(count - 1, 0) // 2]
-    return np.stack((outside.mean(1), unread.mean(1), np.where(count > 0, median, np.nan)), 1)
-
-
 @entry_point
-def read_around(joints, depth, k, apart, seen):
-    """Depths about joints (N, 3), into (N, 1) or (N, 9): NaN outside, 0 without reading.
+def out_of_sight(joints, depth, k):
+    """The shares of joints (21, 3) outside of the image (H, W), and of those behind something.
 
-    They are those of a square of points `apart` metres from each other, row by row.
+    k: (3, 3) float64.
     """
-    height, width = depth.shape
-    side = 3 if seen.shape[1] == 9 else 1
+    return sight(joints, depth, k)
+
+
+@compiled
+def sight(joints, depth, k):
+    """See out_of_sight."""
+    outside = behind = 0
     for n in range(len(joints)):
         z = max(joints[n, 2], _NEAREST_M)
-        for row in range(side):
-            for column in range(side):
-                x = (joints[n, 0] + apart * (column - side // 2)) / z
-                y = (joints[n, 1] + apart * (row - side // 2)) / z
-                u, v = round(k[0, 0] * x + k[0, 2]), round(k[1, 1] * y + k[1, 2])
-                inside = 0 <= u < width and 0 <= v < height
-                read = np.float64(depth[int(v), int(u)]) if inside else np.nan
-                seen[n, side * row + column] = 0.0 if read <= 0 else read
+        read = reading(joints[n, 0] / z, joints[n, 1] / z, depth, k)
+        outside += math.isnan(read)
+        behind += read > 0 and read < z - _BEHIND_M
+    return outside / len(joints), behind / len(joints)
+
+
+@compiled
+def reading(x, y, depth, k):
+    """The depth in direction (x, y, 1): NaN outside of the image, 0 without a reading."""
+    u, v = round(k[0, 0] * x + k[0, 2]), round(k[1, 1] * y + k[1, 2])
+    if not (0 <= u < depth.shape[1] and 0 <= v < depth.shape[0]):
+        return np.nan
+    return max(np.float64(depth[int(v), int(u)]), 0.0)
 
 
 JOINT_FEATURES = (
@@ -279,23 +287,58 @@ def joint_features(
     score: of the image, 0..1.  log_odds: that the estimate is right.
     depth_m: (H, W), 0 = no reading.  k: (3, 3).
     """
-    joints = joints_m.astype(np.float64)
-    features = np.empty((len(joints), len(JOINT_FEATURES)))
+    features = np.empty((len(joints_m), len(JOINT_FEATURES)))
     if detection.empty:
         features[:, _KEYPOINTS] = last[:, _KEYPOINTS]
     else:
         keypoints = detection.keypoints
-        off = np.linalg.norm(joints - keypoints.points_m.numpy(), axis=1)
-        worst = np.concatenate(([off.mean()], off[1:].reshape(5, 4).max(1).repeat(4)))
-        features[:, _KEYPOINTS] = _log_cm_of(keypoints.sigma_m.numpy(), off, worst)
-    outside, unread, surface = _seen_around(joints, depth_m, k).T
-    deeper = np.where(np.isnan(surface), 0.0, joints[:, 2] - surface - _BELOW_M)
-    features[:, 3], features[:, 4] = outside, unread
-    features[:, 5], features[:, 6] = deeper.clip(0, 0.05) / 0.02, (-deeper).clip(0, 0.05) / 0.02
+        compare_keypoints(joints_m, keypoints.points_m.numpy(), keypoints.sigma_m.numpy(), features)
+    look_around(joints_m, depth_m, k.astype(np.float64), _BELOW_M, features)
     features[:, 7] = -math.log(max(score, _LEAST))
-    features[:, 8] = np.log(1e3 * np.maximum(joints[:, 2], _NEAREST_M) / k[0, 0])
     features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features
+
+
+@entry_point
+def compare_keypoints(joints, keypoints, sigma, features):
+    """The first three of JOINT_FEATURES of joints (21, 3), from the network's keypoints."""
+    mean = 0.0
+    for n in range(len(joints)):
+        away = distance(joints[n], keypoints[n])
+        mean += away / len(joints)
+        features[n, 0], features[n, 1] = log_cm(sigma[n]), log_cm(away)
+    features[0, 2] = log_cm(mean)
+    for finger in range(1, len(joints), 4):
+        most = features[finger : finger + 4, 1].max()
+        features[finger : finger + 4, 2] = most
+
+
+@entry_point
+def look_around(joints, depth, k, below, features):
+    """What is seen about joints (21, 3): outside, unread, behind, before, pixel.
+
+    Of a joint 3 x 3 readings are taken, and their median.  below: (21,) m, see _BELOW_M.
+    """
+    near = np.empty(9)
+    for n in range(len(joints)):
+        z = max(joints[n, 2], _NEAREST_M)
+        outside = count = 0
+        for row in range(-1, 2):
+            for column in range(-1, 2):
+                x = (joints[n, 0] + _AROUND_M * column) / z
+                read = reading(x, (joints[n, 1] + _AROUND_M * row) / z, depth, k)
+                outside += math.isnan(read)
+                if read > 0:
+                    near[count] = read
+                    count += 1
+        deeper = 0.0
+        if count > 0:
+            surface = np.sort(near[:count])[(count - 1) // 2]  # the lower middle is the median
+            deeper = joints[n, 2] - surface - below[n]
+        features[n, 3], features[n, 4] = outside / 9, (9 - outside - count) / 9
+        features[n, 5] = min(max(deeper, 0.0), 0.05) / 0.02
+        features[n, 6] = min(max(-deeper, 0.0), 0.05) / 0.02
+        features[n, 8] = math.log(1e3 * z / k[0, 0])
 
 
 @dataclass(frozen=True)
@@ -327,8 +370,8 @@ class ConfidenceModel:
     """When an estimate is lost, and when its track ends; see conf/lost.
 
     confidence: estimates that are right with a lower probability are flagged lost.
-    believe: likewise, until a track was believed for the first time: for that it must be reached for
-        `believe_frames` frames in a row, as SORT's min_hits (Bewley et al., ICIP 2016).
+    believe, believe_frames: what a new track must reach for so many frames in a row to be believed
+        for the first time, as SORT's min_hits (Bewley et al., ICIP 2016).
     believe_at_once: a new track that reaches this is believed in that frame.
     give_up: below this, a frame is bad.  patience: bad frames in a row that end a track; 0 = none.
     whole: estimates whose mean joint error is below 40 mm with a lower probability are flagged lost
