@@ -137,6 +137,8 @@ def _elsewhere(
     missing = {track.side for track in tracks if rare or not track.reliable}
     confirmed = [track for track in tracks if track.confirmed]
     slots = len(state.slots)
+    if slots > 2 and sum(track.reliable for track in tracks) >= slots:
+        return []  # all hands that are asked for are found
     if slots > 2 or (not tracks and (slots > 1 or not state.told)):
         missing = set(OTHER_SIDE)
     elif not tracks:
