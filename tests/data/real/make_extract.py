@@ -4,8 +4,8 @@
     python tests/data/real/make_extract.py RECORDING GIT_DIR OUT.npz
 
 RECORDING: adi_tof, camcube_counts, camcube_group1, camcube_group3, cvar_p1, cvar_p3, cvar_p4,
-cvar_p5, cvar_p6, cvar_p7, fpha, hamer_depth, kinect1_room, r200_ceiling, room_phone, room_table or
-room_workshop. Needs git, numpy and opencv, r200_ceiling also scipy.
+cvar_p5, cvar_p6, cvar_p7, fpha, hamer_depth, kinect1_room, r200_ceiling, room_desk, room_floor,
+room_phone, room_table or room_workshop. Needs git, numpy and opencv, r200_ceiling also scipy.
 """
 
 import io
@@ -179,7 +179,9 @@ def room(folder, K, fps):
 
 
 ROOMS = {
-    # K is that of the repository; none of the other two is told: what such cameras usually have.
+    "desk": ("data/depth", intrinsics(425.0, 425.0, 424.0, 240.0), 1.0),
+    "floor": ("depth", intrinsics(385.0, 385.0, 319.5, 239.5), 1.0),
+    # K is that of the repository; none of the others is told: what such cameras usually have.
     "table": ("data/depth", intrinsics(616.7, 616.9, 324.8, 238.0), 1.0),
     "workshop": ("data/depth", intrinsics(385.0, 385.0, 319.5, 239.5), 30.0),
     "phone": ("depth", intrinsics(213.0, 213.0, 96.0, 128.0), 1.0),
