@@ -60,12 +60,11 @@ def frames_of(device: BaseDevice) -> Iterator[Frame]:
     for frame in device:
         if not isinstance(frame, Frame):
             code: Any = getattr(type(device).__iter__, "__code__", None)
-            place = (
-                code and f", in {code.co_qualname} ({code.co_filename}, line {code.co_firstlineno})"
-            )
+            place = code and f"{code.co_qualname} ({code.co_filename}, line {code.co_firstlineno})"
             raise ToftrackError(
                 "a device must yield Frame(index, timestamp_s, depth, amplitude, radial), and "
-                f"nothing where there is no image, but {type(frame).__name__} came{place or ''}"
+                "nothing where there is no image, but "
+                f"{type(frame).__name__} came, in {place or type(device).__name__}"
             )
         yield frame
 
