@@ -107,7 +107,8 @@ def test_what_is_damaged_or_cut_off_is_read_or_told(tmp_path: Path, kind: str) -
 
 def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
     """Where it was mapped into memory the system would end the process."""
-    path = KINDS["npy"](tmp_path)
+    path = tmp_path / "a.npy"
+    np.save(path, WORDS)
     store = opened(path)
     os.truncate(path, path.stat().st_size - HEIGHT * WIDTH * 2)
     np.testing.assert_allclose(store.image(3)[0], METRES[3], atol=1e-6)
