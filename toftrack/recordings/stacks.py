@@ -111,15 +111,15 @@ def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
     with _reported(path):
         images = np.lib.format.open_memmap(path, mode="r")
     stacked = images[None] if images.ndim == 2 else images
-    return (_Npy(path, stacked) if stacked.flags.c_contiguous else stacked), _PYTHONS
+    return (_Npy(path, stacked, images.offset) if stacked.flags.c_contiguous else stacked), _PYTHONS
 
 
 class _Npy:
     """The images of a .npy, read rather than mapped: one that shrinks would end the process."""
 
-    def __init__(self, path: Path, mapped: np.memmap) -> None:
+    def __init__(self, path: Path, mapped: np.ndarray, offset: int) -> None:
         self.shape, self.dtype = mapped.shape, mapped.dtype
-        self._path, self._offset = path, mapped.offset
+        self._path, self._offset = path, offset
 
     def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
         size = math.prod(self.shape[1:])
