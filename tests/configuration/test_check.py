@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from helpers import programs
 from helpers.tracking import CONF, ROOT
 from omegaconf import OmegaConf
 
@@ -16,7 +17,6 @@ import toftrack.configuration.check as check
 from toftrack import make_tracker
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration
-from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 WRONG = [
@@ -171,11 +171,16 @@ def test_a_configuration_that_is_damaged_is_one_sentence(tmp_path, name: str, te
     assert str(error.value) and "\n" not in str(error.value)
 
 
-def test_the_file_and_the_line_that_are_no_yaml_are_reported() -> None:
-    with pytest.raises(yaml.YAMLError) as error:
-        yaml.safe_load("a: 1\nb: [")
-    reported = sentence(error.value)
-    assert reported.startswith("a file of the configuration is no YAML: ") and "line 2" in reported
+@pytest.mark.parametrize(
+    ("content", "words"), [(b"a: 1\nb: [", "line 2"), (b"name: caf\xe9", "'utf-8' codec")]
+)
+def test_the_file_that_is_no_yaml_is_named(tmp_path: Path, content: bytes, words: str) -> None:
+    (tmp_path / "device").mkdir()
+    (tmp_path / "device" / "mine.yaml").write_bytes(content)
+    with pytest.raises(ToftrackError, match=f"device/mine.yaml' cannot be read as YAML.*{words}"):
+        configuration("device=mine", config_dir=tmp_path)
+    status, _, err = programs.call("--config-dir", ".", "device=mine", folder=tmp_path)
+    assert status == 1 and "device/mine.yaml' cannot be read as YAML" in err and words in err
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:

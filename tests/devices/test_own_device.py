@@ -101,6 +101,19 @@ def test_a_camera_that_vanishes_is_named_and_what_came_before_is_kept(
     assert "free what is needed" not in err and (workplace / "out" / "track.npz").exists()
 
 
+def test_what_is_no_frame_is_told_with_the_place_and_what_came_before_is_kept(
+    workplace: Path, track: Callable
+) -> None:
+    code = (workplace / "my_device.py").read_text()
+    code = code.replace("yield Frame(", "yield None if index == 2 else Frame(")
+    (workplace / "my_device.py").write_text(code)
+    status, _, err = track("device.path=images.raw", "device.focal_px=200")
+    assert status == 1 and "error: a device must yield Frame(index, timestamp_s, " in err
+    assert "but NoneType came, in RawImages.__iter__ (" in err and "my_device.py, line " in err
+    with np.load(workplace / "out" / "track.npz") as result:
+        assert len(result["lost"]) == 2
+
+
 @pytest.mark.parametrize(
     ("code", "reason"),
     [

@@ -195,6 +195,42 @@ def test_a_signal_ends_with_its_status(app: Path, number: int, code: int) -> Non
     assert "Traceback" not in err
 
 
+def test_a_request_that_comes_with_the_end_of_the_terminal_gives_the_status(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What is finished after it says something still, and fails."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    monkeypatch.setattr(sys, "stderr", os.fdopen(writer, "w"))
+
+    def main() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGHUP)
+        finally:
+            print("100 frames", file=sys.stderr, flush=True)
+
+    assert run(main) == 129
+    monkeypatch.undo()
+    assert run(lambda: 1 / 0) == 1, "and of the next one nothing was asked"
+
+
+def test_who_has_read_enough_of_what_hydra_tells_is_no_error(app: Path) -> None:
+    words = (sys.executable, "-m", "toftrack", "track", "--hydra-help")
+    process = subprocess.Popen(words, cwd=app, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.close()
+    assert (process.wait(60), process.stderr.read()) == (0, b"")
+
+
+@pytest.mark.parametrize("words", [["hydra.run.dir="], ["-m", "seed=1", "hydra.sweep.dir="]])
+def test_a_folder_without_a_name_is_not_the_current_one(app: Path, words: list[str]) -> None:
+    with open(app / "conf" / "app.yaml", "a") as config:
+        config.write(CALLBACK)
+    before = set(app.rglob("*"))
+    status, out, err = call(app, *words)
+    assert (status, out) == (1, "") and "dir is empty; give a folder" in err
+    assert set(app.rglob("*")) == before
+
+
 def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     arguments = ["-m", "hydra.sweep.dir=sweep", "fail=clear,late,unexpected,''"]
     status, out, err = call(app, *arguments)
@@ -304,4 +340,4 @@ def test_a_cause_deep_inside_is_what_is_reported() -> None:
 def test_a_full_disk_is_reported_without_a_path() -> None:
     text = sentence(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
     assert "No space left" in text
-    assert "hydra.run.dir" in text
+    assert "hydra.run.dir" in text and "standard output" in text

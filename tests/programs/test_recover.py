@@ -95,11 +95,20 @@ def test_a_file_in_the_place_of_the_results_is_only_replaced_when_asked(run: Pat
     assert recover(run, replace=True)["frames"] == 6
 
 
-@pytest.mark.parametrize("content", [PRECIOUS, bytes.fromhex("000000106674797000000001") * 3, b""])
+@pytest.mark.parametrize("content", [PRECIOUS, bytes.fromhex("000000106674797000000001") * 3])
 def test_what_is_no_video_of_ours_is_not_cut(content: bytes, run: Path) -> None:
     (run / "overlay.mp4").write_bytes(content)
     recover(run)
     assert (run / "overlay.mp4").read_bytes() == content
+
+
+def test_a_video_of_which_no_second_was_whole_goes(run: Path) -> None:
+    """As of a run that was killed in its first second: it would play nothing."""
+    whole = (run / "overlay.mp4").read_bytes()
+    for size in (0, whole.index(b"moof") - 4, whole.index(b"mdat")):
+        (run / "overlay.mp4").write_bytes(whole[:size])
+        recover(run)
+        assert not (run / "overlay.mp4").exists(), size
 
 
 def test_what_the_lines_do_not_tell_stays_in_the_summary(run: Path) -> None:

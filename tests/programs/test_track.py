@@ -8,6 +8,7 @@ import pickle
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -286,6 +287,19 @@ def test_a_bad_setting_is_one_clear_sentence_before_anything_is_written(
     assert (status, out) == (1, "")
     assert err.startswith("error: ") and err.count("\n") == 1
     assert words in err
+
+
+def test_a_view_that_cannot_come_up_leaves_no_files_and_those_that_were_there(
+    here, tmp_path: Path
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        view = "view=browser", f"view.port={taken.getsockname()[1]}"
+        status, _, err = here("device.stop=1", *view)
+        assert status == 1 and "is taken" in err and not (tmp_path / "out").exists()
+        assert here("device.stop=1", "view=none", *QUICK)[0] == 0
+        before = (tmp_path / "out" / "track.npz").read_bytes()
+        assert here("device.stop=1", *view)[0] == 1
+    assert (tmp_path / "out" / "track.npz").read_bytes() == before
 
 
 def test_a_run_that_is_refused_as_another_one_is_writing_leaves_its_log(here, tmp_path) -> None:

@@ -105,6 +105,17 @@ def test_what_is_damaged_or_cut_off_is_read_or_told(tmp_path: Path, kind: str) -
             store.close()
 
 
+def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
+    """Where it was mapped into memory the system would end the process."""
+    path = tmp_path / "a.npy"
+    np.save(path, WORDS)
+    store = opened(path)
+    os.truncate(path, path.stat().st_size - HEIGHT * WIDTH * 2)
+    np.testing.assert_allclose(store.image(3)[0], METRES[3], atol=1e-6)
+    with pytest.raises(ToftrackError, match="frame 4 of '.*' cannot be read"):
+        store.image(4)
+
+
 @pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])
 def test_the_dataset_is_chosen_by_its_name(tmp_path: Path, write: Callable[..., Path]) -> None:
     path = write(tmp_path / f"a.{'h5' if write is hdf5 else 'mat'}", depth=WORDS, ir=WORDS // 2)

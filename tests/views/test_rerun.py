@@ -184,8 +184,10 @@ def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> 
 
 
 def test_a_folder_that_cannot_be_written_is_reported(rerun_view, tmp_path: Path) -> None:
+    view = rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
-        rerun_view.RerunView(tmp_path / "nowhere" / "deep", 25.0, likelihood=f_measure())
+        view.show(moments()[0])
+    view.close()
 
 
 def free_port() -> int:

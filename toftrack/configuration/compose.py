@@ -64,10 +64,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
                 raise ToftrackError(f"{several[1]} has several values; give one") from None
             raise
         except Exception as error:  # whatever the readers of YAML say of somebody's file
-            raise ToftrackError(
-                f"the configuration in '{folder}' cannot be read ({' '.join(str(error).split())}); "
-                "mend its YAML, or give a folder laid out as toftrack's conf/"
-            ) from error
+            raise ToftrackError(sentence(error)) from error
         check_overrides(config, name, overrides)
         return config
 

@@ -9,7 +9,6 @@ import sys
 import traceback
 from collections.abc import Iterator, Sequence
 
-import yaml
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
@@ -35,11 +34,14 @@ def sentence(error: BaseException) -> str:
     for cause in chain:
         if isinstance(cause, MissingMandatoryValue):
             return _of_missing_value(cause)
+        if (path := _read_by_hydra(cause)) and not isinstance(cause, HydraException):
+            reason = _one_line(str(cause))
+            return (
+                f"'{path}' cannot be read as YAML ({reason}); mend it there, and save it as UTF-8"
+            )
         # Some of Hydra's errors are OSErrors too, without being of the system.
         if isinstance(cause, OSError) and not isinstance(cause, HydraException):
             return _of_system(cause)
-        if isinstance(cause, yaml.YAMLError):
-            return f"a file of the configuration is no YAML: {_one_line(str(cause))}; mend it there"
     if any(isinstance(cause, RecursionError) for cause in chain):
         return "a setting or a file is nested too deeply; take out what is not meant"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
@@ -70,6 +72,13 @@ def place_of(error: BaseException) -> str:
     return ""
 
 
+def _read_by_hydra(error: BaseException) -> str | None:
+    """The file of a configuration in the reading of which it was raised; None for others."""
+    frames = (frame for frame, _ in traceback.walk_tb(error.__traceback__))
+    found = (f.f_locals.get("full_path") for f in frames if f.f_code.co_name == "load_config")
+    return next(filter(None, found), None)
+
+
 def _chain(error: BaseException | None) -> Iterator[BaseException]:
     """The error and its causes, the error first: Hydra wraps what a constructor raises."""
     seen: set[int] = set()
@@ -88,7 +97,10 @@ def _of_system(error: OSError) -> str:
     if error.filename is None and (place := place_of(error)):  # as of a camera that is gone
         return f"{reason}{place} ({FULL_ERROR}=1 shows the traceback)"
     if error.filename is None:
-        return f"{reason}; free what is needed, or choose another folder with hydra.run.dir=DIR"
+        return (
+            f"{reason}; free what is needed, or have standard output, or the files of a run "
+            "(hydra.run.dir=DIR), go elsewhere"
+        )
     return (
         f"'{os.fsdecode(error.filename)}' cannot be read or written ({reason}); check the path and "
         "its permissions, or choose another output folder with hydra.run.dir=DIR"

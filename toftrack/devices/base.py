@@ -55,5 +55,19 @@ class BaseDevice:
         raise ToftrackError(f"{type(self).__name__} has no frames; write its method __iter__")
 
 
+def frames_of(device: BaseDevice) -> Iterator[Frame]:
+    """Its frames; ToftrackError for anything else, which one of somebody's own may yield."""
+    for frame in device:
+        if not isinstance(frame, Frame):
+            code: Any = getattr(type(device).__iter__, "__code__", None)
+            place = code and f"{code.co_qualname} ({code.co_filename}, line {code.co_firstlineno})"
+            raise ToftrackError(
+                "a device must yield Frame(index, timestamp_s, depth, amplitude, radial), and "
+                "nothing where there is no image, but "
+                f"{type(frame).__name__} came, in {place or type(device).__name__}"
+            )
+        yield frame
+
+
 Device = BaseDevice
 """What whoever takes one calls it."""

@@ -18,7 +18,7 @@ from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import devices_of_files, quoted, searched, setting_names
 from toftrack.configuration.plugins import offer_installed
 from toftrack.errors import ToftrackError
-from toftrack.programs import command_line
+from toftrack.programs import command_line, shutdown
 from toftrack.recordings.bag_names import is_bag
 
 _WITH_VALUE = frozenset(
@@ -76,6 +76,8 @@ def start(
     sys.argv = [program, *options_first(arguments)]
     try:
         application()
+    except BrokenPipeError:  # of what Hydra itself tells, as --hydra-help: nobody reads on
+        shutdown.forget_streams()
     finally:
         sys.argv = before
 

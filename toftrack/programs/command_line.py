@@ -84,16 +84,13 @@ def run(main: Callable[[], object]) -> int:
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)
         return 1 if end.code else 0
-    except BrokenPipeError:
-        # Nobody reads the output any more; python would complain again when it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+    except BrokenPipeError:  # nobody reads the output any more
+        shutdown.forget_streams()
+        return shutdown.requested_status() or 1
     except _JobFailedError as failure:
-        _report(failure.error)
-        return 1
+        return _report(failure.error)
     except Exception as error:
-        _report(error)
-        return 1
+        return _report(error)
     finally:
         for folder, parents in _new_folders.items():
             with contextlib.suppress(OSError):  # the error that is being reported counts for more
@@ -180,10 +177,14 @@ def job_words() -> str:
     return " ".join((f"#{hydra.job.num}", *hydra.overrides.task))
 
 
-def _report(error: BaseException, job: str = "") -> None:
+def _report(error: BaseException, job: str = "") -> int:
+    """Tell of an error; returns the exit status. Where nobody reads it, as the terminal was closed
+    with which a request to end came, that is the request's.
+    """
     if _program.tracebacks:
         traceback.print_exception(error)
-    print(f"error: {job}{sentence(error)}", file=sys.stderr, flush=True)
+    told = shutdown.say(f"error: {job}{sentence(error)}", sys.stderr)
+    return 1 if told else shutdown.requested_status() or 1
 
 
 # Hydra makes the folder of a run, with its own files in it, before the program has looked at its
@@ -207,10 +208,10 @@ class FailedJobs(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         # Before Hydra writes: two runs that begin together would share, or clear, one folder.
-        _expect(Path(config.hydra.run.dir), alone=True)
+        _expect(_given(config, "run"), alone=True)
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        folder = Path(config.hydra.sweep.dir)
+        folder = _given(config, "sweep")
         _expect(folder)
         for job in folder.iterdir() if folder.is_dir() else ():
             let_links_go(job)
@@ -221,6 +222,13 @@ class FailedJobs(Callback):
         for path in _summaries(config):
             if path.stat().st_mtime_ns != self._before.get(path) and "error" in read_object(path):
                 _program.failed_jobs.add(path.parent)
+
+
+def _given(config: DictConfig, kind: str) -> Path:
+    if not (folder := config.hydra[kind].dir):  # which would be the current one
+        error = ToftrackError(f"hydra.{kind}.dir is empty; give a folder, or . for the current one")
+        raise _JobFailedError(error)
+    return Path(folder)
 
 
 def _expect(folder: Path, alone: bool = False) -> None:

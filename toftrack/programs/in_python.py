@@ -18,7 +18,7 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from toftrack.configuration.compose import configuration, one_sentence
-from toftrack.devices.base import BaseDevice
+from toftrack.devices.base import BaseDevice, frames_of
 from toftrack.errors import ToftrackError, module_of_extra, reported_errors
 from toftrack.files.archives import write_archive
 from toftrack.files.safe_files import write_whole
@@ -113,7 +113,7 @@ class Tracking:
             self._metadata = run_metadata(config, device, run.tracker)
             make_view = instantiate(config.view, _partial_=True)
             with make_view(folder=Path(), fps=device.fps, frames=device.frames) as view:
-                for frame in device:
+                for frame in frames_of(device):
                     tracked, smoothed = run.frame(frame, time.perf_counter(), view)
                     self.camera, self.depth_m = tracked.camera, tracked.depth_m
                     yield tracked.estimates, smoothed

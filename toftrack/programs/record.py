@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration, one_sentence, searched
-from toftrack.devices.base import Device
+from toftrack.devices.base import Device, frames_of
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.errors import ToftrackError, check_number
 from toftrack.programs import shutdown
@@ -86,7 +86,7 @@ def record_frames(
     try:
         with device, _progress(frames) as bar:
             began = time.monotonic()
-            for count, frame in enumerate(device, 1):
+            for count, frame in enumerate(frames_of(device), 1):
                 with shutdown.not_now():
                     recorder.put(frame, wait=True)
                 bar.update()

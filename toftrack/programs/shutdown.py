@@ -41,6 +41,8 @@ class _Requests:
     """What was asked since the program began."""
 
     count: int = 0
+    first: int | None = None
+    """Its signal."""
     waiting: int | None = None
     """A signal that takes effect when what must not be interrupted is done."""
     shields: int = 0
@@ -67,7 +69,7 @@ def handled(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
 @contextmanager
 def obeyed() -> Iterator[None]:
     """Within it the signals raise EndedError."""
-    _requests.count, _requests.waiting = 0, None
+    _requests.count, _requests.first, _requests.waiting = 0, None, None
     with handled(_request):
         yield
 
@@ -90,12 +92,19 @@ def exit_status(end: KeyboardInterrupt) -> int:
     return 128 + (end.number if isinstance(end, EndedError) else signal.SIGINT)
 
 
-def say(text: str, stream: TextIO) -> None:
-    """Print a text, even where the terminal has been closed and nobody reads it any more."""
+def requested_status() -> int | None:
+    """Likewise, where somebody has asked at all; None where nobody has."""
+    return None if _requests.first is None else 128 + _requests.first
+
+
+def say(text: str, stream: TextIO) -> bool:
+    """Print a text, even where the terminal has been closed; whether somebody may read it."""
     try:
         print(text, file=stream, flush=True)
     except (OSError, ValueError):
         forget_streams()
+        return False
+    return True
 
 
 def forget_streams() -> None:
@@ -114,6 +123,7 @@ def forget_streams() -> None:
 
 def _request(number: int, frame: FrameType | None) -> None:
     _requests.count += 1
+    _requests.first = _requests.first or number
     if _requests.count == 1 and not _requests.shields:
         raise EndedError(number)
     if _requests.count == 1:

@@ -25,7 +25,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
-from toftrack.devices.base import Device
+from toftrack.devices.base import Device, frames_of
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames.estimate import Estimate, confidence_words, is_vacant
 from toftrack.frames.frame import Frame
@@ -100,19 +100,23 @@ def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Reco
 def _track(config: DictConfig, folder: Path, run: Run) -> float:
     device, tracker = run.device, run.tracker
     ended: KeyboardInterrupt | None = None
+    results: ResultWriter | None = None
     with device:
         metadata = run_metadata(config, device, tracker)
         if not in_sweep():
             print(_opening(metadata, device), file=sys.stderr)
-        # It is the first to write into the folder, which it refuses to share with another run.
-        with ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results:
-            make_view = instantiate(config.view, _partial_=True)
-            try:
-                with make_view(folder=folder, fps=device.fps, frames=device.frames) as view:
-                    run.follow(results, view, folder)
-            except KeyboardInterrupt as end:
-                ended = end
-    summary = results.summary or {}
+        make_view = instantiate(config.view, _partial_=True)
+        try:
+            with (
+                # It may not come up, as where its port is taken, and writes nothing by then.
+                make_view(folder=folder, fps=device.fps, frames=device.frames) as view,
+                # The first to write into the folder, which it refuses to share with another run.
+                ResultWriter(folder, metadata, JOINT_NAMES, device.truth) as results,
+            ):
+                run.follow(results, view, folder)
+        except KeyboardInterrupt as end:
+            ended = end
+    summary = results and results.summary or {}
     _report(summary, folder, run.recorder)
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
@@ -175,7 +179,7 @@ class Run:
             progress = partial(progress, leave=False, disable=None)
         try:
             with progress() as bar, logging_redirect_tqdm():  # above the bar, on lines of their own
-                for frame in self.device:
+                for frame in frames_of(self.device):
                     began_s = time.perf_counter()
                     with shutdown.not_now():
                         tracked, _ = self.frame(frame, began_s, view, keep)

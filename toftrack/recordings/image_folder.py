@@ -236,17 +236,18 @@ def read_image_folder(
 
 
 def _is_image(name: str) -> bool:
-    return PurePosixPath(name).suffix.lower() in (*_DEPTH, *_PICTURES)
+    return name.lower().endswith(_DEPTH + _PICTURES)
 
 
 def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
     """Depth and amplitude images, and what else there is, in words; ToftrackError where no depth is
     to be told from the rest."""
-    images = [n for n in files.names if _is_image(n) and not PurePosixPath(n).name.startswith(".")]
+    images = [n for n in files.names if _is_image(n) and not _last(n).startswith(".")]
     images = sorted(sorted(images), key=_order)
     grey = [name for name in images if not _surely_no_depth(files, name)]
-    amplitude = [n for n in grey if PurePosixPath(n).name.lower().startswith("amplitude")]
-    depth = [name for name in grey if name not in set(amplitude)]
+    amplitude = [n for n in grey if _last(n).lower().startswith("amplitude")]
+    known = set(amplitude)
+    depth = [name for name in grey if name not in known]
     # Infrared has 16 bits, too.
     depth = [name for name in depth if "depth" in name.lower()] or depth
     others = sorted(set(images) - {*depth, *amplitude}, key=_order)
@@ -256,7 +257,7 @@ def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
             f"{files.what} has no depth image (grey of 16 bits, *.png or *.tif, or floats, *.tif or"
             f" *.exr){there}; choose another"
         )
-    folders = sorted({str(PurePosixPath(name).parent) for name in depth})
+    folders = sorted(folder or "." for folder in {name.rpartition("/")[0] for name in depth})
     if len(folders) > 1:
         raise ToftrackError(
             f"{files.what} has images in {len(folders)} folders, {', '.join(folders[:5])}; give "
@@ -274,9 +275,14 @@ def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
     )
 
 
+def _last(name: str) -> str:
+    """A name without its folders: a path object of each of many would take seconds."""
+    return name.rpartition("/")[2]
+
+
 def _surely_no_depth(files: Files, name: str) -> bool:
     """By what it says of itself; what is damaged is told when its turn comes."""
-    if PurePosixPath(name).suffix.lower() in _PICTURES:
+    if name.lower().endswith(_PICTURES):
         return True
     try:
         with broken_is_value_error(), files.open(name) as stream:

@@ -110,7 +110,22 @@ def _reported(path: Path, what: str = "") -> Iterator[None]:
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
     with _reported(path):
         images = np.lib.format.open_memmap(path, mode="r")
-    return (images[None] if images.ndim == 2 else images), _PYTHONS
+    stacked = images[None] if images.ndim == 2 else images
+    return (_Npy(path, stacked, images.offset) if stacked.flags.c_contiguous else stacked), _PYTHONS
+
+
+class _Npy:
+    """The images of a .npy, read rather than mapped: one that shrinks would end the process."""
+
+    def __init__(self, path: Path, mapped: np.ndarray, offset: int) -> None:
+        self.shape, self.dtype = mapped.shape, mapped.dtype
+        self._path, self._offset = path, offset
+
+    def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
+        size = math.prod(self.shape[1:])
+        begin = self._offset + int(at[0]) * size * self.dtype.itemsize
+        with open_to_read(self._path) as stream:
+            return np.fromfile(stream, self.dtype, size, offset=begin).reshape(self.shape[1:])
 
 
 class _Tiff:

@@ -57,7 +57,8 @@ class TrackedFrame:
 class View:
     """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown).
 
-    Used with `with`, which closes it. It is left when the results are written, so it may stay.
+    Used with `with`, which closes it. It writes nothing before the first frame. It is left when the
+    results are written, so it may stay.
     """
 
     def show(self, tracked: TrackedFrame) -> None:

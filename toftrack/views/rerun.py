@@ -73,8 +73,8 @@ class RerunView(View):
     frame; a viewer that does not keep up misses some, and never holds up the tracker. The settings:
     conf/view/rerun.yaml.
 
-    Raises ToftrackError when the file cannot be written, there is no viewer, or for both connect
-    and spawn.
+    Raises ToftrackError when there is no viewer, or for both connect and spawn, and by `show` when
+    the file cannot be written.
     """
 
     def __init__(
@@ -97,13 +97,9 @@ class RerunView(View):
             elif connect:
                 _require_answer(connect)
             self._stream.connect_grpc(connect or _ADDRESS, default_blueprint=_blueprint())
-        else:
-            with writing(self._path, *_RERUN_ERRORS):
-                open_new(self._path, replace=True).close()  # the library follows links
-                self._stream.save(self._path, default_blueprint=_blueprint())
         self._entities = _Entities(self._stream, likelihood)
         self._frames: queue.Queue[TrackedFrame | None] = queue.Queue(_QUEUED_FRAMES)
-        self._left_out = 0
+        self._begun, self._left_out = False, 0
         self._failure: Exception | None = None
         # A daemon, because nothing frees a thread that waits for a viewer that is stuck.
         self._thread = threading.Thread(target=self._work, name="toftrack-rerun", daemon=True)
@@ -113,6 +109,11 @@ class RerunView(View):
         """Hand one frame over; raises ToftrackError when one before it could not be logged."""
         self._raise_failure()
         if self._path is not None:
+            if not self._begun:
+                with writing(self._path, *_RERUN_ERRORS):
+                    open_new(self._path, replace=True).close()  # the library follows links
+                    self._stream.save(self._path, default_blueprint=_blueprint())
+                self._begun = True
             self._frames.put(tracked)
             return
         try:

@@ -84,10 +84,14 @@ class VideoFile:
 def cut_to_whole(path: Path) -> None:
     """Take from a video's end the second that was not written as a whole, where there is one.
 
-    Players stop there with an error. What is no video of ours stays as it is. Raises OSError.
+    Players stop there with an error. Without any whole second the file goes. What is no video of
+    ours stays as it is. Raises OSError.
     """
     with open_in_place(path, make=False) as file:
         _cut(file)
+        empty = not os.fstat(file.fileno()).st_size
+    if empty:
+        path.unlink()
 
 
 def _cut(file: BinaryIO | io.FileIO) -> None:
@@ -101,7 +105,8 @@ def _cut(file: BinaryIO | io.FileIO) -> None:
             break
         position += length
         kinds.append(kind)
-        if kind != b"moof":  # it describes the box of pictures that follows
+        # A moof describes the box of pictures that follows; without any there is nothing to play.
+        if kind != b"moof" and b"mdat" in kinds:
             whole = position
         file.seek(position)
     # Others begin otherwise, and have boxes whose length stands elsewhere.
