@@ -153,7 +153,7 @@ def modest_files() -> Iterator[None]:
     try:
         yield
     finally:
-        OmegaConf.load = staticmethod(load)  # type: ignore[assignment]
+        OmegaConf.load = staticmethod(load)  # type: ignore[method-assign]
 
 
 def _check_size(file: Any) -> None:

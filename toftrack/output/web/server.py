@@ -305,7 +305,7 @@ class WebServer:
 
 
 class _Connection(ServerConnection):
-    """Tells its server from when on it takes a descriptor, and until when; bounds what it answers."""
+    """Tells its server from when on it takes a descriptor, and until when."""
 
     def __init__(self, owner: WebServer, *given: Any, **settings: Any) -> None:
         super().__init__(*given, **settings)
