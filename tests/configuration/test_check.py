@@ -18,6 +18,7 @@ from toftrack import make_tracker
 from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
+from toftrack.programs.main import main
 
 WRONG = [
     ("detector.hypotheses=0", "detector.hypotheses=0 is not possible; give a whole number above 0"),
@@ -203,3 +204,38 @@ def test_every_setting_of_the_tables_is_one() -> None:
                     pending.append((f"{prefix}.{name}", node[name]))
     bounded = check._ABOVE_ZERO | check._AT_MOST.keys() | check._OPEN_ENDED
     assert bounded | check._MAY_BE_NONE <= keys
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "a0: &a0 [1, 1, 1, 1, 1]\n"
+        + "".join(f"a{i}: &a{i} [{','.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9)),
+        f"many: [{'1,' * 20_000}]\n",
+        "#" * 200_000,
+    ],
+    ids=["aliases", "values", "letters"],
+)
+@pytest.mark.parametrize("run", [False, True])
+def test_a_file_that_is_large_or_grows_by_its_aliases_is_refused_at_once(
+    text: str, run: bool, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "stream").mkdir()
+    (tmp_path / "stream" / "mine.yaml").write_text(f"_target_: mine.Stream\n{text}")
+    if run:
+        assert main(["track", "--config-dir", str(tmp_path), "stream=mine", "--cfg", "job"]) == 1
+        said = capsys.readouterr().err
+    else:
+        with pytest.raises(ToftrackError) as error:
+            configuration("stream=mine", config_dir=tmp_path)
+        said = str(error.value)
+    assert "mine.yaml' is too large for a file of the configuration" in said
+    assert said.count("\n") == run
+
+
+def test_aliases_and_anchors_of_usual_size_are_read(tmp_path: Path) -> None:
+    (tmp_path / "stream").mkdir()
+    text = "_target_: mine.Stream\na: &a [1, 2]\nb: &b {one: *a, two: *a}\nc: [*b, *b]\n"
+    (tmp_path / "stream" / "mine.yaml").write_text(text)
+    stream = configuration("stream=mine", config_dir=tmp_path).stream
+    assert stream.c == [{"one": [1, 2], "two": [1, 2]}] * 2

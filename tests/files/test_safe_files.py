@@ -11,6 +11,8 @@ import pytest
 
 from toftrack.files import safe_files
 from toftrack.files.safe_files import (
+    leave_folder,
+    lock_folder,
     make_folder,
     open_in_place,
     open_new,
@@ -158,3 +160,39 @@ def test_where_the_system_knows_no_such_flag_links_are_refused_all_the_same(
     path.symlink_to(elsewhere)
     with pytest.raises(OSError, match="symbolic link"):
         open_in_place(path)
+
+
+@pytest.mark.parametrize("write", [WRITERS["write_whole"], WRITERS["open_new"]])
+@pytest.mark.parametrize("link", [True, False])
+def test_nothing_is_written_into_what_took_the_place_of_a_locked_folder(
+    write: Callable[[Path], object], link: bool, path: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / path.name).write_text("precious")
+    lock = lock_folder(path.parent)
+    assert lock is not None
+    write(path)
+    path.parent.rename(tmp_path / "away")
+    if link:
+        path.parent.symlink_to(tmp_path / "other")
+    else:
+        (tmp_path / "other").rename(path.parent)
+    with pytest.raises(OSError, match="another folder has taken its place"):
+        write(path)
+    assert path.read_text() == "precious"
+    leave_folder(lock)
+    write(path)  # which it is for the user to know
+
+
+def test_a_folder_that_is_swapped_while_a_file_is_written_stays_as_it_was(
+    path: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "other").mkdir()
+    lock = lock_folder(path.parent)
+    assert lock is not None
+    with pytest.raises(OSError, match="another folder"), whole_file(path) as stream:
+        stream.write(b"new")
+        path.parent.rename(tmp_path / "away")
+        path.parent.symlink_to(tmp_path / "other")
+    assert list((tmp_path / "other").iterdir()) == []
+    leave_folder(lock)

@@ -20,6 +20,7 @@ from hydra.utils import instantiate
 import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
+from toftrack.files.safe_files import leave_folder
 from toftrack.output.files import own_folder
 from toftrack.programs import command_line
 from toftrack.programs.command_line import FailedJobs, run
@@ -169,7 +170,7 @@ def test_a_folder_into_which_a_run_is_writing_stays_as_it_is(app: Path) -> None:
     status, out, err = call(app, "hydra.run.dir=deep/shared")
     assert (status, out) == (1, "") and err.startswith("error: another run is writing into")
     assert err.count("\n") == 1 and not list(shared.iterdir())
-    os.close(lock)
+    leave_folder(lock)
     assert call(app, "fail=clear", "hydra.run.dir=deep/shared")[0] == 1, "and nobody has it still"
     assert call(app, "hydra.run.dir=deep/shared")[0] == 0 and (shared / ".hydra").exists()
 

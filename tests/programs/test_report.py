@@ -9,6 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from toftrack.errors import ToftrackError
 from toftrack.programs.report import group_runs, main, read_runs, report, sweep_figure
@@ -77,6 +78,15 @@ def test_jobs_that_failed_are_named_and_left_out_of_the_means(sweep: Path, capsy
     assert pca.error == pytest.approx((10 + 14 + 16) / 3)
     assert pca.spread is None  # one seed lacks a recording: its mean is of something else
     assert sum(run.error is not None for run in lle.runs) == 2
+
+
+def test_what_jobs_say_cannot_command_the_terminal(sweep: Path, capsys) -> None:
+    (sweep / "2" / "summary.json").write_text(json.dumps({"error": "no hand\x1b]0;mine\x07"}))
+    overrides = yaml.safe_dump(["pose_space=\x1b[31m", "seed=1"])
+    (sweep / "4" / ".hydra" / "overrides.yaml").write_text(overrides)
+    main([str(sweep)])
+    text = capsys.readouterr().out
+    assert "no hand ]0;mine" in text and "[31m" in text and "\x1b" not in text
 
 
 def test_a_sweep_in_which_all_failed_is_still_reported(sweep: Path, capsys) -> None:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import re
 import threading
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+import yaml
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.utils import JobRuntime
@@ -23,6 +26,8 @@ from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 _ROOT = "config.yaml"
+_MOST_LETTERS, _MOST_VALUES = 2**16, 5000
+"""In a file of the configuration; Hydra takes two seconds for so many."""
 _composing = threading.Lock()
 
 
@@ -55,13 +60,20 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
                 f"the override {override!r} is no text; give overrides as on the command line, "
                 "'hand.side=left'"
             )
-    with one_sentence(), _own_hydra(), initialize_config_dir(str(folder), version_base="1.3"):
+    with (
+        one_sentence(),
+        _own_hydra(),
+        modest_files(),
+        initialize_config_dir(str(folder), version_base="1.3"),
+    ):
         name = _ROOT.removesuffix(".yaml")
         try:
             config = compose(name, overrides=list(overrides))
         except (HydraException, OmegaConfBaseException) as error:
             if several := re.match("(?:Ambiguous|Sweep param)[^']*'(.*)'", str(error)):
                 raise ToftrackError(f"{several[1]} has several values; give one") from None
+            raise
+        except ToftrackError:
             raise
         except Exception as error:  # whatever the readers of YAML say of somebody's file
             raise ToftrackError(sentence(error)) from error
@@ -120,6 +132,50 @@ def _own_hydra() -> Iterator[None]:
             GlobalHydra.instance().hydra = application
             JobRuntime.instance().conf = job
             VersionBase.instance().version_base = version
+
+
+@contextmanager
+def modest_files() -> Iterator[None]:
+    """Within it, Hydra refuses a file that is larger than configurations are, or becomes so by its
+    aliases: it copies every value many times, for hours where a small file repeats itself.
+    """
+    load = OmegaConf.load
+
+    def checked(file: Any) -> Any:
+        if isinstance(file, io.TextIOBase):  # which Hydra alone gives
+            _check_size(file)
+        return load(file)
+
+    OmegaConf.load = staticmethod(checked)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        OmegaConf.load = staticmethod(load)  # type: ignore[method-assign]
+
+
+def _check_size(file: Any) -> None:
+    """Raise ToftrackError where the text or the values are too many, an alias counted as what it
+    stands for.
+    """
+    text, count = file.read(_MOST_LETTERS + 1), 0
+    file.seek(0)
+    sizes: dict[str | None, int] = {}
+    within: list[tuple[str | None, int]] = []
+    with suppress(yaml.YAMLError):  # Hydra meets it, too, and says where
+        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+            if isinstance(event, yaml.CollectionEndEvent):
+                anchor, before = within.pop()
+                sizes[anchor] = count - before + 1
+            elif isinstance(event, yaml.NodeEvent):
+                count += sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
+                if isinstance(event, yaml.CollectionStartEvent):
+                    within.append((event.anchor, count))
+            if count > _MOST_VALUES or len(text) > _MOST_LETTERS:
+                raise ToftrackError(
+                    f"'{file.name}' is too large for a file of the configuration (at most "
+                    f"{_MOST_VALUES} values, aliases counted as what they stand for); let your "
+                    "part read a file of its own"
+                )
 
 
 @contextmanager

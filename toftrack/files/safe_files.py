@@ -39,6 +39,10 @@ _KINDS = {
 }
 
 
+_kept: dict[str, int] = {}
+"""The descriptors of the folders that `lock_folder` has locked, by their absolute paths."""
+
+
 class _NoFileError(OSError):
     """What is named is a pipe, a device or a socket."""
 
@@ -131,7 +135,8 @@ def lock(stream: IO[bytes] | RawIOBase | int) -> None:
 
 
 def lock_folder(path: str | Path) -> int | None:
-    """Make a folder where there is none, and have it for oneself until the descriptor is closed.
+    """Make a folder where there is none, and have it for oneself until `leave_folder`; meanwhile,
+    what takes its place is not written into.
 
     None on Windows, which locks no folders. Raises BlockingIOError while another process has it,
     and OSError.
@@ -144,6 +149,7 @@ def lock_folder(path: str | Path) -> int | None:
         try:
             lock(descriptor)
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):
+                _kept[os.path.abspath(path)] = descriptor
                 return descriptor
         except FileNotFoundError:
             pass  # whoever had it before took it away, and so what is locked is none any more
@@ -151,6 +157,22 @@ def lock_folder(path: str | Path) -> int | None:
             os.close(descriptor)
             raise
         os.close(descriptor)
+
+
+def leave_folder(descriptor: int) -> None:
+    """Give a folder free that `lock_folder` has locked."""
+    for path in [path for path, kept in _kept.items() if kept == descriptor]:
+        del _kept[path]
+    os.close(descriptor)
+
+
+def _check_kept(path: str | Path) -> None:
+    """OSError where another folder, or a link to one, has taken the place of a file's folder."""
+    folder = os.path.dirname(os.path.abspath(path))
+    kept = _kept.get(folder)
+    if kept is not None and not os.path.samestat(os.fstat(kept), os.stat(folder)):
+        why = "another folder has taken its place; what was written before is where it was moved to"
+        raise OSError(errno.ESTALE, why, folder)
 
 
 @contextmanager
@@ -168,6 +190,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
+        _check_kept(path)  # that may have been long ago
         os.replace(partial, path)
     except BaseException:
         with suppress(OSError):
@@ -211,6 +234,7 @@ def make_folder(path: str | Path) -> None:
 
 def check_replaceable(path: str | Path) -> None:
     """Raise OSError where something stands that is no file, or the link to one."""
+    _check_kept(path)
     with suppress(FileNotFoundError):
         _refuse(path, os.lstat(path))
 

@@ -15,7 +15,13 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.compose import devices_of_files, quoted, searched, setting_names
+from toftrack.configuration.compose import (
+    devices_of_files,
+    modest_files,
+    quoted,
+    searched,
+    setting_names,
+)
 from toftrack.configuration.plugins import offer_installed
 from toftrack.errors import ToftrackError
 from toftrack.programs import command_line, shutdown
@@ -75,7 +81,8 @@ def start(
     before = sys.argv
     sys.argv = [program, *options_first(arguments)]
     try:
-        application()
+        with modest_files():
+            application()
     except BrokenPipeError:  # of what Hydra itself tells, as --hydra-help: nobody reads on
         shutdown.forget_streams()
     finally:

@@ -29,7 +29,7 @@ from toftrack.configuration.check import check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, place_of, sentence
 from toftrack.errors import ToftrackError
 from toftrack.files.json_text import read_object
-from toftrack.files.safe_files import let_links_go, write_whole
+from toftrack.files.safe_files import leave_folder, let_links_go, write_whole
 from toftrack.output.files import own_folder
 from toftrack.programs import shutdown
 
@@ -97,7 +97,7 @@ def run(main: Callable[[], object]) -> int:
                 _clear(folder, parents)
         _new_folders.clear()
         while _program.locks:
-            os.close(_program.locks.pop())
+            leave_folder(_program.locks.pop())
         _program.running = False
     if _program.failed_jobs:
         count = len(_program.failed_jobs)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, one_line, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import open_to_read, write_whole
 from toftrack.programs.command_line import Parser
@@ -104,7 +104,7 @@ def _read_run(path: Path, folder: Path) -> Run:
 
 def _printable(text: str) -> str:
     """A text as UTF-8 has it: names of files and JSON may hold what no file or terminal takes."""
-    return text.encode("utf-8", "backslashreplace").decode()
+    return one_line(text).encode("utf-8", "backslashreplace").decode()
 
 
 def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:

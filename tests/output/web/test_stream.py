@@ -141,26 +141,41 @@ def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
         eventually(lambda: all(map(ended, opened)))
 
 
+def listen(mute: socket.socket, stream: WebSocketStream) -> None:
+    """Make a client of a socket that is never read."""
+    url = urlsplit(stream.url)
+    mute.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+    mute.connect((url.hostname, url.port))
+    mute.sendall(
+        f"GET /stream HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\n"
+        "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
+    )
+    eventually(lambda: stream._server.clients)
+
+
 def test_a_client_that_never_reads_stops_nothing_and_its_oldest_lines_go(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.INFO)
     estimate = hand_estimate(0)
     with socket.socket() as mute, websocket_stream(waiting=3) as stream:
-        url = urlsplit(stream.url)
-        mute.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        mute.connect((url.hostname, url.port))
-        mute.sendall(
-            f"GET /stream HTTP/1.1\r\nHost: {url.netloc}\r\nUpgrade: websocket\r\n"
-            "Connection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
-            "Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n".encode()
-        )
-        eventually(lambda: stream._server.clients)
+        listen(mute, stream)
         for index in range(1500):
             stream.send((replace(estimate, index=index),))
     words = caplog.text.split()
     sent, dropped = (int(words[words.index(word) - 1]) for word in ("estimates", "dropped"))
     assert sent + dropped >= 1499 and dropped > 100  # one may have been on its way
+
+
+def test_a_client_that_pings_and_never_reads_is_cut_off(stream: WebSocketStream) -> None:
+    pings = (b"\x89\xfd" + bytes(4 + 125)) * 8000  # 1 MiB
+    with socket.socket() as mute:
+        listen(mute, stream)
+        with pytest.raises(ConnectionError):
+            for _ in range(50):  # the system keeps some, too
+                mute.sendall(pings)
+    eventually(lambda: not stream._server.clients)
 
 
 @pytest.mark.parametrize(

@@ -55,6 +55,8 @@ _BACKLOG = 32
 """Connections that the system keeps, and that are accepted at a time."""
 _MOST_RECEIVED_BYTES = 4096
 """In a message of a client; who sends a longer one is cut off."""
+_MOST_UNREAD_BYTES = 2**16
+"""Of answers to pings, which nothing else bounds; who sends more and does not read is cut off."""
 _REPORTED_EVERY_S = 60.0
 _MOST_ORIGINS = 20
 """That the log tells of."""
@@ -307,11 +309,19 @@ class _Connection(ServerConnection):
 
     def __init__(self, owner: WebServer, *given: Any, **settings: Any) -> None:
         super().__init__(*given, **settings)
-        self._owner = owner
+        self._owner, self._unread_bytes = owner, 0
 
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
         self._owner.opened(self)
+
+    def data_received(self, data: bytes) -> None:
+        before = self.transport.get_write_buffer_size()
+        super().data_received(data)
+        answers = self.transport.get_write_buffer_size() - before
+        self._unread_bytes = answers + (self._unread_bytes if before else 0)
+        if self._unread_bytes > _MOST_UNREAD_BYTES:
+            self.transport.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
