@@ -102,6 +102,7 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     ended: KeyboardInterrupt | None = None
     with device:
         metadata = run_metadata(config, device, tracker)
+        earlier = _written(folder)
         if not in_sweep():
             print(_opening(metadata, device), file=sys.stderr)
         # It is the first to write into the folder, which it refuses to share with another run.
@@ -113,7 +114,7 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
             except KeyboardInterrupt as end:
                 ended = end
     summary = results.summary or {}
-    _report(summary, folder, run.recorder)
+    _report(summary, folder, earlier, run.recorder)
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
@@ -260,14 +261,21 @@ def _sure_words(estimate: Estimate) -> str:
     return ", ".join(filter(None, (confidence_words(estimate.confidence), estimate.state_name)))
 
 
-def _report(summary: dict[str, Any], folder: Path, recorder: Recorder | None) -> None:
-    """A table and the files; of a sweep's job one line."""
+def _written(folder: Path) -> set[tuple[Path, int]]:
+    """The files in a folder, each with when it was written."""
+    return {(path, path.stat().st_mtime_ns) for path in folder.iterdir() if path.is_file()}
+
+
+def _report(
+    summary: dict[str, Any], folder: Path, earlier: set[tuple[Path, int]], recorder: Recorder | None
+) -> None:
+    """A table and the files that are not as earlier; of a sweep's job one line."""
     if in_sweep():
         line = metrics_line(summary) if summary.get("frames") else "no frames"
         shutdown.say(f"{job_words()}: {line}; {folder}", sys.stdout)
         return
     if summary.get("frames"):
-        files = sorted(path for path in folder.iterdir() if path.is_file())
+        files = sorted(path for path, _ in _written(folder) - earlier)
         lines = [f"  {path}" for path in files if path.suffix != ".log"]
         shutdown.say(metrics_table(summary), sys.stdout)
         shutdown.say("\n".join([f"results: {folder}", *lines]), sys.stdout)
