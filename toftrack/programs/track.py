@@ -150,6 +150,12 @@ class Run:
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the run at its end."""
         dropped = tuple(filter(None, (self.realtime.words(),)))
+        about = self.device.description
+        if dropped and about.get("realtime") and not about.get("repeat"):
+            dropped += (
+                "the first frames take longest, which are many of a short recording;"
+                " device.repeat=true plays it on and on, and device.realtime=false drops none",
+            )
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
         model = self.tracker.model
