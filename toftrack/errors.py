@@ -52,8 +52,7 @@ def module_of_extra(name: str, what: str, extra: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise ToftrackError(
-            f"{what}, which is not installed: pip install 'toftrack[{extra}]', in a checkout "
-            f"pip install -e '.[{extra}]'"
+            f"{what}, which is not installed: pip install 'toftrack[{extra}]'"
         ) from None
 
 

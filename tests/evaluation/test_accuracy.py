@@ -116,8 +116,12 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
     (tmp_path / "text.npz").write_text("nothing")
     (tmp_path / "old.json").write_text("{}")
     (tmp_path / "labels.json").write_text("[")
+    with np.load(folder / "a.npz") as a:
+        np.savez(tmp_path / "mine.npz", depth_m=a["depth_m"], K=a["K"])
     cases = [
         ([str(empty)], "has no recording with truth"),
+        ([str(tmp_path / "mine.npz")], "mine.npz' has no truth (an .npz with 'joints_m')"),
+        ([str(tmp_path / "mine.npz")], "--labels FILE, which `toftrack label RECORDING` makes"),
         ([str(tmp_path / "text.npz")], "text.npz"),
         ([str(folder), str(folder)], "two recordings are called 'short/a'"),
         ([str(folder), "--compare", str(tmp_path / "old.json")], "has no 'rows'"),

@@ -86,6 +86,24 @@ def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:
     assert "default, searching" in capsys.readouterr().out
 
 
+def test_rows_are_printed_as_they_come(monkeypatch, capsys, one_thread) -> None:
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    monkeypatch.setattr(speed, "decode_times", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        benchmark.main(["speed", "--particles", "4", "--seconds", "0.01", "--no-baselines"])
+    out = capsys.readouterr().out.splitlines()
+    assert [line.split()[:3] for line in out if line.startswith("scoring")] == [
+        ["scoring", "torch", "4"],
+        ["scoring", "numba", "4"],
+    ]
+    assert [line for line in out if "triton" in line] == [
+        line for line in out if line.startswith("note: triton is not timed")
+    ]
+
+
 @pytest.mark.parametrize("words", [["--compute", "cuda"], ["--particles", "0"]])
 def test_what_cannot_be_timed_is_reported(words, monkeypatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)

@@ -149,6 +149,7 @@ def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
 
 
 GIVEN = random_angles(5).rad2deg().numpy()
+OF_RUN = tuple(f"{name}_rad" for name in ANGLE_NAMES)
 NAN, SIGNS = GIVEN.copy(), GIVEN.copy()
 NAN[3, 2], SIGNS[:, 6::4] = np.nan, -80.0
 
@@ -157,6 +158,7 @@ NAN[3, 2], SIGNS[:, 6::4] = np.nan, -80.0
     ("values", "names", "units", "more", "part"),
     [
         (GIVEN[:, :-1], ANGLE_NAMES[:-1], "degrees", b"", "no column 'little_dip_flexion'"),
+        (GIVEN, OF_RUN, None, b"", "was exported from a run; give data=run data.path=RUN"),
         (GIVEN, ANGLE_NAMES, "degrees", b"1," * 20 + b"much", "pose 6 is 'much', not a number"),
         (GIVEN, ANGLE_NAMES, "degrees", b"1,2", "pose 6 has 2 values for 21 columns"),
         (NAN, ANGLE_NAMES, "degrees", b"", "thumb_mcp_abduction of pose 4 is not a finite number"),

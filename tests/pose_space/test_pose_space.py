@@ -163,8 +163,10 @@ def test_the_gpu_decodes_and_encodes_as_the_cpu(kind: str) -> None:
 
 
 @of_every_kind
-@pytest.mark.parametrize("dims", [0, 78, 500])
+@pytest.mark.parametrize("dims", [0, 50, 78, 500])
 def test_too_many_or_no_dimensions_are_one_clear_error(kind: str, dims: int) -> None:
+    if (kind, dims) == ("kernel_pca", 50):
+        return  # the one kind that may have more than there are angles
     with pytest.raises(ToftrackError, match=f"pose_space.dims={dims}"):
         fit_pose_space(kind, dims)
 
@@ -242,7 +244,7 @@ def test_a_bad_model_file_is_one_clear_error(tmp_path, header, arrays, part) -> 
 
 
 def test_a_file_that_is_missing_or_no_archive_is_one_clear_error(tmp_path) -> None:
-    with pytest.raises(ToftrackError, match="no pose-space file"):
+    with pytest.raises(ToftrackError, match="no pose-space file.*toftrack train"):
         load_pose_space(tmp_path / "nothing.npz")
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(ToftrackError, match="not a pose-space file .it is no .npz"):

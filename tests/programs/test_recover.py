@@ -149,6 +149,23 @@ def test_a_new_run_lets_nothing_go_that_is_no_runs(name: str, tmp_path: Path) ->
     assert (tmp_path / name).read_bytes() == PRECIOUS
 
 
+def test_a_new_run_lets_all_of_an_earlier_one_go_and_says_so(
+    run: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    mine = ("hand.csv", "hand_shape_anna.json")
+    for name in ("overlay.mp4", "overlay.png", "hand_shape_3.json", *mine):
+        (run / name).write_bytes(PRECIOUS)
+    with ResultWriter(run, {}, JOINT_NAMES):
+        assert {path.name for path in run.iterdir() if path.read_bytes() == PRECIOUS} == set(mine)
+        assert not (run / "hand_shape_2.json").exists()
+    assert "earlier run" in caplog.text and str(run) in caplog.text
+
+
+def test_a_file_of_a_run_in_the_place_of_its_folder_is_reported(run: Path) -> None:
+    with pytest.raises(ToftrackError, match="not the output folder of a run.*give a folder"):
+        recover(run / LINES)
+
+
 @pytest.mark.parametrize("name", ["track.log", ".hydra/config.yaml", ".hydra"])
 def test_hydra_writes_through_no_link(name: str, run: Path, tmp_path: Path) -> None:
     elsewhere = tmp_path / "elsewhere"

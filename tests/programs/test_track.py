@@ -310,6 +310,18 @@ def test_a_run_that_is_refused_as_another_one_is_writing_leaves_its_log(here, tm
         assert (tmp_path / "out" / "track.log").read_text().startswith("of the first run\n")
 
 
+def test_a_folder_that_is_used_again_lists_what_this_run_wrote(here, tmp_path) -> None:
+    with ResultWriter(tmp_path / "out", {}, JOINT_NAMES):
+        pass
+    for name in ("overlay.mp4", "hand.csv"):
+        (tmp_path / "out" / name).write_text("of the first run")
+    _, out, err = here("device.stop=2", "view=none", *QUICK)
+    assert "earlier run" in err and "track.npz" in out
+    assert "overlay.mp4" not in out and "hand.csv" not in out
+    assert (tmp_path / "out" / "hand.csv").exists()
+    assert "earlier run" in (tmp_path / "out" / "track.log").read_text()  # which goes on
+
+
 def test_an_output_folder_that_cannot_be_written_is_one_clear_sentence(here, tmp_path) -> None:
     (tmp_path / "file").write_text("in the way")
     status, out, err = here("hydra.run.dir=file/out")

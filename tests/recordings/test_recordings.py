@@ -244,7 +244,7 @@ IMAGES = np.ones((T, H, W), np.float32)
 @pytest.mark.parametrize(
     ("key", "value", "words"),
     [
-        ("depth_m", None, "missing"),
+        ("depth_m", None, "no 'depth_m' .*, but .*K, "),
         ("K", None, "missing"),
         ("depth_m", IMAGES[0], "3 dimensions"),
         ("depth_m", IMAGES[:0], "zero frames"),

@@ -162,7 +162,7 @@ def _announce(dispatcher: Any) -> None:
     if "compiling" not in _said and not (folder and any(os.scandir(folder))):
         _said.add("compiling")
         often = "once on a machine" if folder else "in every run"
-        log.info(f"compiling kernels ({often}, about 25 s)")
+        log.info(f"compiling kernels ({often}, for up to a minute)")
 
 
 if hasattr(os, "register_at_fork"):

@@ -69,9 +69,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
         name = _ROOT.removesuffix(".yaml")
         try:
             config = compose(name, overrides=list(overrides))
-        except (HydraException, OmegaConfBaseException) as error:
-            if several := re.match("(?:Ambiguous|Sweep param)[^']*'(.*)'", str(error)):
-                raise ToftrackError(f"{several[1]} has several values; give one") from None
+        except (HydraException, OmegaConfBaseException):
             raise
         except ToftrackError:
             raise

@@ -13,6 +13,7 @@ from hydra.errors import HydraException, MissingConfigException, OverrideParseEx
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
+from toftrack.configuration import configuration_folder
 from toftrack.configuration.plugins import ENTRY_POINTS, installed
 from toftrack.errors import ToftrackError
 
@@ -20,6 +21,8 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 """The environment variable that asks for tracebacks."""
 _ALIKE, _MOST = 0.6, 12
 """How much of a name must be right, 0..1; so many names are listed at most."""
+_MEANT = {"K": "intrinsics", "web": "browser"}
+"""What other programs call a setting or a choice."""
 _PAPERS_GROUP = "start"
 """A group that experiment=paper alone has."""
 _OF_PAPER = "{0} belongs to experiment=paper; give experiment=paper as well, or leave {0} out"
@@ -141,6 +144,8 @@ def _of_override(chain: Sequence[BaseException]) -> str | None:
     for error in chain:
         if isinstance(error, OverrideParseException):
             return _of_syntax(error)
+        if several := re.match("(?:Ambiguous|Sweep param)[^']*'(.*)'", str(error)):
+            return _of_several(several[1])
         if isinstance(error, MissingConfigException) and error.missing_cfg_file:
             return _of_choice(error.missing_cfg_file, error.options or ())
     return _of_key(chain)
@@ -159,12 +164,19 @@ def _of_syntax(error: OverrideParseException) -> str:
     )
 
 
+def _of_several(override: str) -> str:
+    key, _, value = override.partition("=")
+    may_be_list = "(" not in value and not (configuration_folder() / key).is_dir()
+    hint = f", or a list, '{key}=[{value}]'" if may_be_list else ""
+    return f"{override} has several values; give one{hint} (toftrack track -m takes each in turn)"
+
+
 def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     group, _, word = missing.rpartition("/")
     if not group or not options:
         return None
     shortened = re.compile(".*".join(map(re.escape, word))).match  # kpca, of kernel_pca
-    likely = next(filter(shortened, options), None) or _nearest(word, options)
+    likely = next(filter(shortened, options), None) or _nearest(_MEANT.get(word, word), options)
     hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
     return f"there is no {group}={word}; {hint} {', '.join(options)}"
 
@@ -190,7 +202,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     keys = [name for name in _keys(known) if not name.startswith("hydra.") or key[:5] == "hydra"]
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
-    likely = _nearest(key, [name for name in keys if not key.startswith(f"{name}.")])
+    meant = key.removesuffix(last) + _MEANT.get(last, last)
+    likely = _nearest(meant, [name for name in keys if not key.startswith(f"{name}.")])
     likely = likely or next(iter(same), None)
     text = f"there is no setting {key}"
     if key == "device.path":

@@ -41,13 +41,13 @@ class Replay(BaseDevice):
     A `.npz` is loaded; everything else is read frame by frame, so that long ones need no more
     memory than short ones.
 
-    path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, and drop a
-    frame when the next one is already due (the last is always delivered); otherwise every frame, as
-    fast as it is asked for.  camera_file, intrinsics (fx, fy, cx, cy in pixels): instead of the
-    recording's own camera.  unit_m (metres of one step of whole numbers), fps, dataset (of a
-    `.h5` or `.mat` that has several): of recordings that do not say it.  store: the recording,
-    where it is open already. Raises ToftrackError: the recording or the camera cannot be used, or
-    the range lies outside.
+    path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, counted
+    from when the first one is done, and drop a frame when the next one is already due (the last is
+    always delivered); otherwise every frame, as fast as it is asked for.  camera_file, intrinsics
+    (fx, fy, cx, cy in pixels): instead of the recording's own camera.  unit_m (metres of one step
+    of whole numbers), fps, dataset (of a `.h5` or `.mat` that has several): of recordings that do
+    not say it.  store: the recording, where it is open already. Raises ToftrackError: the recording
+    or the camera cannot be used, or the range lies outside.
     """
 
     def __init__(
@@ -116,13 +116,15 @@ class Replay(BaseDevice):
         self._recording.close()
 
     def __iter__(self) -> Iterator[Frame]:
-        self.dropped, begin = 0, time.monotonic()
+        self.dropped, begin = 0, math.nan
         count, last = 0, math.inf if self._repeat else len(self._range) - 1
         try:
             while count <= last:
-                if self._realtime:
+                if self._realtime and count:
                     count = self._paced(count, last, time.monotonic() - begin)
                 yield self._frame(count)
+                if not count:  # much is loaded for the first one, which a recording can wait for
+                    begin = time.monotonic()
                 count += 1
         finally:
             self._recording.close()

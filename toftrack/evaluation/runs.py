@@ -76,10 +76,10 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
         files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
         mine = [source for source in (_source(file, known) for file in files) if source]
         if not mine:
-            what = f"the folder '{path}' has no recording" if path.is_dir() else f"'{path}' comes"
             raise ToftrackError(
-                f"{what} with truth (an .npz with 'joints_m'); give a folder that has one, or "
-                "labels of its images with --labels FILE"
+                f"'{path}' has no {'recording with ' if path.is_dir() else ''}truth (an .npz with "
+                "'joints_m'); give one that has, or labels of its images with --labels FILE, which "
+                "`toftrack label RECORDING` makes"
             )
         found += mine
     for one in known:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import os
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -138,14 +138,17 @@ def filter_states(n: int, wrist: Tensor) -> Tensor:
 
 
 def score_times(
-    particles: Sequence[int], seconds: float, device: torch.device, baselines: bool
-) -> tuple[list[Row], list[str]]:
-    """By the number of particles, the baselines at few of them, and notes on why a back end does
+    particles: Sequence[int],
+    seconds: float,
+    device: torch.device,
+    baselines: bool,
+    notes: list[str],
+) -> Iterator[Row]:
+    """By the number of particles, the baselines at few of them; the notes get why a back end does
     not score on this device."""
     shape = default_hand_shape().to(device)
     chunk = 4 if device.type == "cpu" else 128  # hypotheses whose images suit the cache
     scorers: dict[str, Scorer] = {}
-    notes = []
     for name in BASELINES if baselines else ():
         scorers[name] = ReferenceScorer(shape, chunk, name == "stepping")
     for name in BACK_ENDS:
@@ -154,9 +157,11 @@ def score_times(
         try:
             scorers[name] = make_scorer(name, shape, device)
         except ToftrackError as error:
-            notes.append(f"{name}: {error}")
+            why = str(error).partition(";")[0]  # and not what a run is to do about it
+            notes.append(f"note: {name} is not timed: {why}")
+            print(notes[-1], flush=True)
     found, wrist = sample_evidence()
-    evidence, rows = found.to(device), []
+    evidence = found.to(device)
     for n in particles:
         states = filter_states(n, wrist).to(device)
         calls = {
@@ -165,8 +170,7 @@ def score_times(
             if name not in BASELINES or n <= _SLOW_PARTICLES
         }
         times, pixels = interleaved(calls, seconds, device), evidence.hand.numel()
-        rows += [_row("scoring", name, n, pixels, took) for name, took in times.items()]
-    return rows, notes
+        yield from (_row("scoring", name, n, pixels, took) for name, took in times.items())
 
 
 def decode_times(seconds: float, device: torch.device) -> list[Row]:
@@ -260,45 +264,48 @@ def enlarged(
 def run(
     particles: Sequence[int], compute: str, seconds: float, frames: bool, baselines: bool
 ) -> dict[str, object]:
-    """Measure everything; returns what --json writes. Raises ToftrackError: no such device."""
+    """Measure everything and print each row as it comes; returns what --json writes. Raises
+    ToftrackError: no such device."""
     if compute == "cuda" and not torch.cuda.is_available():
         raise ToftrackError("there is no CUDA device here; give --compute cpu")
     device = torch.device(compute)
-    rows, notes = score_times(particles, seconds, device, baselines)
-    if frames:
-        for name, overrides in CONFIGURATIONS.items():
-            rows += frame_times(name, [*overrides, f"compute={compute}"], seconds)
-        # On the CPU so many as the table's take seconds; there the configuration's say enough.
-        for n in particles if compute == "cuda" else ():
-            given = (f"filter.particles={n}", f"compute={compute}")
-            rows.append(frame_times(f"default, {n}", given, seconds)[0])
-    rows += decode_times(seconds, device)
-    return {
-        "machine": {
-            "processor": processor(),
-            "cores": os.cpu_count(),
-            "threads": torch.get_num_threads(),
-            "torch": torch.__version__,
-            "device": torch.cuda.get_device_name() if compute == "cuda" else "cpu",
-        },
-        "rows": rows,
-        "notes": notes,
+    machine = {
+        "processor": processor(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "device": torch.cuda.get_device_name() if compute == "cuda" else "cpu",
     }
-
-
-def show(result: dict) -> str:
-    """The result as one table of text."""
-    machine = result["machine"]
-    lines = [
+    print(
         f"{machine['processor']}, {machine['threads']} threads, torch {machine['torch']},"
-        f" {machine['device']}",
-        f"{'what':<13}{'method':<22}{'N':>7}{'pixels':>9}"
+        f" {machine['device']}\n{'what':<13}{'method':<22}{'N':>7}{'pixels':>9}"
         f"{'min ms':>11}{'median ms':>11}{'repeats':>9}",
-    ]
-    for row in result["rows"]:
-        lines.append(
-            f"{row['table']:<13}{row['method']:<22}{row['count']:>7}{row['pixels'] or '':>9}"
-            f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
-        )
-        lines += [f"    {part:<58}{took:>11.3f}" for part, took in row["parts"].items()]
-    return "\n".join([*lines, *result["notes"]])
+        flush=True,
+    )
+    rows: list[Row] = []
+    notes: list[str] = []
+
+    def measured() -> Iterator[Row]:
+        yield from score_times(particles, seconds, device, baselines, notes)
+        for name, overrides in CONFIGURATIONS.items() if frames else ():
+            yield from frame_times(name, [*overrides, f"compute={compute}"], seconds)
+        # On the CPU so many as the table's take seconds; there the configuration's say enough.
+        for n in particles if frames and compute == "cuda" else ():
+            given = (f"filter.particles={n}", f"compute={compute}")
+            yield frame_times(f"default, {n}", given, seconds)[0]
+        yield from decode_times(seconds, device)
+
+    for row in measured():
+        rows.append(row)
+        print(_line(row), flush=True)
+    return {"machine": machine, "rows": rows, "notes": notes}
+
+
+def _line(row: Row) -> str:
+    """A row as text, and below it the parts of a frame."""
+    line = (
+        f"{row['table']:<13}{row['method']:<22}{row['count']:>7}{row['pixels'] or '':>9}"
+        f"{row['min_ms']:>11.3f}{row['median_ms']:>11.3f}{row['repeats']:>9}"
+    )
+    parts = (f"    {part:<58}{took:>11.3f}" for part, took in row["parts"].items())
+    return "\n".join([line, *parts])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import mmap
 import os
 from collections.abc import Iterator
@@ -10,7 +11,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import MOST_HANDS, ToftrackError
 from toftrack.files.json_text import read_json, read_object
 from toftrack.files.safe_files import (
     check_replaceable,
@@ -21,11 +22,15 @@ from toftrack.files.safe_files import (
     remove_partial,
 )
 
+_log = logging.getLogger(__name__)
+
 LINES = "track.jsonl"
 """The file of a run's folder that grows, and that is locked while it does."""
+_SHAPES = tuple(f"hand_shape_{slot}.json" for slot in range(2, MOST_HANDS + 1))
+"""Of all slots but the first, whose file every run writes."""
 WHOLE_FILES = (
     *("run.json", "track.npz", "summary.json", "overlay.png"),
-    *("hand_shape.json", "hand_shape_2.json"),
+    *("hand_shape.json", *_SHAPES),
 )
 """Those that take their place when they are done, and of which a kill may leave a part."""
 RUN_FORMAT = "toftrack-run"
@@ -135,7 +140,8 @@ def make_way(folder: Path) -> None:
     Raises OSError, too.
     """
     ends = ("track.npz", "summary.json")
-    if read_object(folder / "run.json").get("format") != RUN_FORMAT:
+    replaced = read_object(folder / "run.json").get("format") == RUN_FORMAT
+    if not replaced:
         for name in (LINES, *ends):
             if not _may_go(folder / name):
                 raise ToftrackError(
@@ -145,6 +151,11 @@ def make_way(folder: Path) -> None:
     for name in ends:
         check_replaceable(folder / name)
         (folder / name).unlink(missing_ok=True)
+    if replaced:
+        for name in ("overlay.mp4", "overlay.png", *_SHAPES):  # which this run may not write
+            if (folder / name).is_file():
+                (folder / name).unlink()
+        _log.warning("an earlier run in '%s' is replaced; exports and figures of it stay", folder)
     remove_partial(folder, WHOLE_FILES)
 
 

@@ -286,7 +286,7 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
     path = folder / "run.json"
     try:
         facts = read_json(path)
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise ToftrackError(
             f"'{folder}' is not the output folder of a run: it has no run.json; give a folder that "
             "`toftrack track` wrote, such as outputs/DATE/TIME"

@@ -33,7 +33,7 @@ from toftrack.pose_space.pca import PCAPoseSpace, fit_pca
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
-_ADVICE = "make one with train_pose_space.py"
+_ADVICE = "make one with toftrack train"
 _NATURAL = 120
 _DATA: dict[str, Callable[[], PoseData]] = {
     "natural": partial(natural_data, _NATURAL),
@@ -195,7 +195,7 @@ def make_pose_space(
         if data not in _DATA:
             raise ToftrackError(
                 f"pose_space.data={data} is unknown; give {' or '.join(_DATA)}, or a file of"
-                " train_pose_space.py for others: pose_space.file=FILE"
+                " toftrack train for others: pose_space.file=FILE"
             )
         return fit_pose_space(kind, dims, _DATA[data](), **settings)
     space = load_pose_space(file, kind)

@@ -301,7 +301,7 @@ def _fit_neighbours(
     """
     x = angles.double().cpu().numpy()
     most = len(x) - 1
-    _check_dims(dims, x, most - 1)
+    _check_dims(dims, x, min(most - 1, x.shape[1]))
     if neighbours is not None and not dims < neighbours <= most:
         raise ToftrackError(
             f"pose_space.neighbours={neighbours} must be above the {dims} dimensions and at most"

@@ -57,7 +57,6 @@ def _speed(arguments: Sequence[str]) -> None:
     result = speed.run(given.particles, given.compute, given.seconds, given.frames, baselines)
     if given.json:
         write_whole(given.json, json.dumps(result, indent=1) + "\n")
-    print(speed.show(result))
 
 
 def _alternating(arguments: Sequence[str]) -> None:

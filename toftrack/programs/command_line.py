@@ -74,7 +74,7 @@ def run(main: Callable[[], object]) -> int:
             status = main()
             _new_folders.clear()
     except KeyboardInterrupt as end:
-        shutdown.say("interrupted: what was done until then is kept", sys.stderr)
+        shutdown.say("interrupted", sys.stderr)  # what was kept was said
         shutdown.forget_streams()
         return shutdown.exit_status(end)
     except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser

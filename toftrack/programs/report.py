@@ -251,13 +251,19 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
-    about = "Gather the jobs of a sweep into one table."
+    about = "Gather the jobs of a sweep, or whatever runs are below a folder, into one table."
     parser = Parser(prog="toftrack report", description=about)
-    parser.add_argument("folder", help="the sweep's folder, multirun/DATE/TIME")
+    about = "the sweep's, multirun/DATE/TIME; to compare two runs, one into which you moved both"
+    parser.add_argument("folder", nargs="+", help=about)
     about = "of summary.json, as metrics.fingertip_mm; default the mean joint error"
     parser.add_argument("--figure", help=about)
     given = parser.parse_args(arguments)
-    report(given.folder, given.figure)
+    if len(given.folder) > 1:
+        raise ToftrackError(
+            f"toftrack report takes one folder, but {len(given.folder)} are given; to compare runs,"
+            " move them into one and give that"
+        )
+    report(given.folder[0], given.figure)
 
 
 _Point = tuple[str, float, float, float | None]

@@ -103,6 +103,7 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     results: ResultWriter | None = None
     with device:
         metadata = run_metadata(config, device, tracker)
+        earlier = _written(folder)
         if not in_sweep():
             print(_opening(metadata, device), file=sys.stderr)
         make_view = instantiate(config.view, _partial_=True)
@@ -117,7 +118,7 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
         except KeyboardInterrupt as end:
             ended = end
     summary = results and results.summary or {}
-    _report(summary, folder, run.recorder)
+    _report(summary, folder, earlier, run.recorder)
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
@@ -153,6 +154,12 @@ class Run:
     def notes(self) -> tuple[str, ...]:
         """What is to be said of the run at its end."""
         dropped = tuple(filter(None, (self.realtime.words(),)))
+        about = self.device.description
+        if dropped and about.get("realtime") and not about.get("repeat"):
+            dropped += (
+                "the first frames take longest, which are many of a short recording;"
+                " device.repeat=true plays it on and on, and device.realtime=false drops none",
+            )
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
         model = self.tracker.model
@@ -264,14 +271,21 @@ def _sure_words(estimate: Estimate) -> str:
     return ", ".join(filter(None, (confidence_words(estimate.confidence), estimate.state_name)))
 
 
-def _report(summary: dict[str, Any], folder: Path, recorder: Recorder | None) -> None:
-    """A table and the files; of a sweep's job one line."""
+def _written(folder: Path) -> set[tuple[Path, int]]:
+    """The files in a folder, each with when it was written."""
+    return {(path, path.stat().st_mtime_ns) for path in folder.iterdir() if path.is_file()}
+
+
+def _report(
+    summary: dict[str, Any], folder: Path, earlier: set[tuple[Path, int]], recorder: Recorder | None
+) -> None:
+    """A table and the files that are not as earlier; of a sweep's job one line."""
     if in_sweep():
         line = metrics_line(summary) if summary.get("frames") else "no frames"
         shutdown.say(f"{job_words()}: {line}; {folder}", sys.stdout)
         return
     if summary.get("frames"):
-        files = sorted(path for path in folder.iterdir() if path.is_file())
+        files = sorted(path for path, _ in _written(folder) - earlier)
         lines = [f"  {path}" for path in files if path.suffix != ".log"]
         shutdown.say(metrics_table(summary), sys.stdout)
         shutdown.say("\n".join([f"results: {folder}", *lines]), sys.stdout)

@@ -61,6 +61,8 @@ _TRUTH: dict[str, tuple[type, tuple[int, ...]]] = {
 _OTHER = {name: f"{name}2" for name in _TRUTH} | {"joints_m": "joints2_m"}
 """The keys of the other hand's."""
 _KEYS = (*_IMAGES, *_CAMERA, "fps", "timestamp_s", *_TRUTH, *_OTHER.values(), "metadata")
+_MOST_NAMED = 200
+"""Signs of keys that are none of these, in an error."""
 _IN_THE_MIDDLE, _ASIDE = 0.12, 0.15
 """How far from the image's middle the centre of K lies, in shares of its sides."""
 
@@ -216,6 +218,12 @@ def write_recording(
 def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
     # Of unknown keys, too, before anything is used: a file that carries objects is not ours.
     headers = {name: archive.header(name, None) for name in archive.names}
+    if not {"depth_m", "radial_m"} & headers.keys():
+        some = ", ".join(headers)[:_MOST_NAMED]
+        raise ToftrackError(
+            f"the recording '{path}' has no 'depth_m' (or 'radial_m'), but {some or 'nothing'}; "
+            "save its depth images under that name"
+        )
     images = {name for name in _IMAGES if name in headers}
     if sum(headers[name].size for name in images) <= LOADED_BYTES:
         images.clear()
@@ -228,8 +236,6 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
 
 def _parse(arrays: dict[str, Any]) -> Recording:
     depth_key = "depth_m" if "depth_m" in arrays else "radial_m"
-    if depth_key not in arrays:
-        raise ToftrackError("the required key 'depth_m' is missing; add it (or 'radial_m')")
     if "K" not in arrays:
         raise ToftrackError("the required key 'K' (3x3 camera matrix, pixels) is missing; add it")
     depth = _check_depth(arrays[depth_key], depth_key)

@@ -149,8 +149,8 @@ class _Bag:
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise ToftrackError(
-                f"'{path}' is read by rosbags ({error}): pip install -e '.[ros]' (recordings of "
-                "cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
+                f"'{path}' is read by rosbags ({error}): pip install 'toftrack[ros]' (recordings "
+                "of cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
             ) from error
         # The messages that are read are the same in every release of ROS 2.
         store = types.Stores.ROS1_NOETIC if self._is_one else types.Stores.ROS2_HUMBLE

@@ -201,10 +201,10 @@ def load_sdk(otherwise: str = "") -> ModuleType:
                 return _imported()
             raise ToftrackError(
                 "pyrealsense2 needs libusb-1.0, which is not installed: pip install "
-                "-e '.[realsense]' brings one, as does apt install libusb-1.0-0"
+                "'toftrack[realsense]' brings one, as does apt install libusb-1.0-0"
             ) from error
         raise ToftrackError(
-            f"device=realsense needs pyrealsense2 ({error}): pip install -e '.[realsense]'"
+            f"device=realsense needs pyrealsense2 ({error}): pip install 'toftrack[realsense]'"
             f"{otherwise}"
         ) from error
 

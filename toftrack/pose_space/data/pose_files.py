@@ -144,6 +144,8 @@ def _read_csv(path: str) -> _Content:
     if twice:
         raise ToftrackError(f"{path} has {header.count(twice[0])} columns {twice[0]!r}; keep one")
     missing = [name for name in ANGLE_NAMES if name not in header]
+    if missing and f"{missing[0]}_rad" in header:
+        raise ToftrackError(f"{path} was exported from a run; give data=run data.path=RUN")
     if missing:
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
         raise ToftrackError(
