@@ -273,7 +273,7 @@ def _sure_words(estimate: Estimate) -> str:
 
 def _written(folder: Path) -> set[tuple[Path, int]]:
     """The files in a folder, each with when it was written."""
-    return {(path, path.stat().st_mtime_ns) for path in folder.iterdir() if path.is_file()}
+    return {(path, path.stat().st_mtime_ns) for path in folder.glob("*") if path.is_file()}
 
 
 def _report(
