@@ -17,6 +17,7 @@ from typing import Any, Protocol, Self
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.safe_files import check_replaceable
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import (
     LARGEST_MEDIAN_M,
@@ -137,6 +138,7 @@ class Recorder:
                     )
         what = f"the recording '{self.path}' cannot be written"
         with reported_errors(what, "choose another place"):
+            check_replaceable(self.path)  # before a long recording that could not end there
             return UnfinishedRecording(self._part, self._overwrite)
 
     def _run(self) -> None:
