@@ -141,20 +141,25 @@ def class_probabilities(log_poses, classes, other, trust, found):
     log_poses: (M,) log densities of the definitions' poses.  classes: (M,) theirs.
     other: log prior weight of "other".  trust: 0 .. 1, what the frame counts.
     """
-    last, most = len(found) - 1, np.full(len(found), -np.inf)
-    number, total = np.zeros(len(found)), np.zeros(len(found))
-    most[last], number[last] = 0.0, 1.0
-    for m in range(len(classes)):
-        most[classes[m]] = max(most[classes[m]], log_poses[m])
-        number[classes[m]] += 1
-    total[last] = math.exp(-most[last])
-    for m in range(len(classes)):
-        total[classes[m]] += math.exp(log_poses[m] - most[classes[m]])
+    # Loops: numba takes seconds to compile what arrays have for each of these.
+    last, largest, whole = len(found) - 1, -np.inf, 0.0
     for c in range(len(found)):
-        mean = most[c] + math.log(total[c] / number[c])
-        found[c] = trust * (mean + (other if c == last else 0.0))
-    found[:] = np.exp(found - found.max())
-    found[:] = found / found.sum()
+        most = 0.0 if c == last else -np.inf
+        for m in range(len(classes)):
+            if classes[m] == c:
+                most = max(most, log_poses[m])
+        number, total = (1, math.exp(-most)) if c == last else (0, 0.0)
+        for m in range(len(classes)):
+            if classes[m] == c:
+                number += 1
+                total += math.exp(log_poses[m] - most)
+        found[c] = trust * (most + math.log(total / number) + (other if c == last else 0.0))
+        largest = max(largest, found[c])
+    for c in range(len(found)):
+        found[c] = math.exp(found[c] - largest)
+        whole += found[c]
+    for c in range(len(found)):
+        found[c] /= whole
 
 
 @dataclass(frozen=True, eq=False)

@@ -308,9 +308,11 @@ def compare_keypoints(joints, keypoints, sigma, features):
         mean += away / len(joints)
         features[n, 0], features[n, 1] = log_cm(sigma[n]), log_cm(away)
     features[0, 2] = log_cm(mean)
-    for finger in range(1, len(joints), 4):
-        most = features[finger : finger + 4, 1].max()
-        features[finger : finger + 4, 2] = most
+    for n in range(1, len(joints)):
+        first = n - (n - 1) % 4
+        features[n, 2] = features[first, 1]
+        for other in range(first, first + 4):
+            features[n, 2] = max(features[n, 2], features[other, 1])
 
 
 @entry_point
@@ -328,13 +330,17 @@ def look_around(joints, depth, k, below, features):
                 x = (joints[n, 0] + _AROUND_M * column) / z
                 read = reading(x, (joints[n, 1] + _AROUND_M * row) / z, depth, k)
                 outside += math.isnan(read)
-                if read > 0:
-                    near[count] = read
+                if read > 0:  # sorted in: numba takes seconds to compile np.sort
+                    at = count
+                    while at > 0 and near[at - 1] > read:
+                        near[at] = near[at - 1]
+                        at -= 1
+                    near[at] = read
                     count += 1
         deeper = 0.0
         if count > 0:
-            surface = np.sort(near[:count])[(count - 1) // 2]  # the lower middle is the median
-            deeper = joints[n, 2] - surface - below[n]
+            # The lower middle is the median.
+            deeper = joints[n, 2] - near[(count - 1) // 2] - below[n]
         features[n, 3], features[n, 4] = outside / 9, (9 - outside - count) / 9
         features[n, 5] = min(max(deeper, 0.0), 0.05) / 0.02
         features[n, 6] = min(max(-deeper, 0.0), 0.05) / 0.02
