@@ -99,7 +99,7 @@ def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
 def test_a_hand_keeps_its_slot(hands: int) -> None:
     state = before(hands, track=1, known=True)
     assert numbers(state, hand(0), hand(1))[0] == 1
-    while_lost = numbers(state, hand(0), hand(1, lost=True, log_odds=0.5))
+    while_lost = numbers(state, hand(0), hand(1, lost=True, log_odds=1.2))
     assert while_lost[:2] == [1, 0][:hands]
 
 
@@ -107,7 +107,7 @@ def test_the_only_slot_goes_to_a_hand_that_is_much_surer() -> None:
     """As when an elbow was taken for the hand while something hid it."""
     state = before(track=1, known=True)
     assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=0.0)) == [0]
-    assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=1.0)) == [1]
+    assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=1.5)) == [1]
 
 
 @pytest.mark.parametrize("told", ["right", "left"])
