@@ -43,6 +43,7 @@ def _follow(tracker: Tracker) -> None:
     scene = sample()
     found = [tracker.step(depth, scene.k) for depth in scene.depth_m[:3]]
     assert found[-1].state_name == "tracking"
+    assert all(one.values() for one in found), "what is computed on demand, too"
 
 
 def _follow_anew() -> None:

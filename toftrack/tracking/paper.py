@@ -200,6 +200,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     return state, (info,), (estimate,)
 
 
+@small_operations()
 def _joint_sigma(
     joints_m: np.ndarray,
     filtered: ParticleSet,

@@ -17,6 +17,7 @@ from torch import Tensor
 from toftrack.compute import particle_filter
 from toftrack.compute.pace import FRAME_S, Spans
 from toftrack.compute.rigid import bound
+from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.frames.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames.frame import DepthImage
@@ -236,6 +237,7 @@ def make_estimate(
     )
 
 
+@small_operations()
 def covariance_of(filtered: ParticleSet, model: FilterModel) -> np.ndarray:
     """(6 + d, 6 + d) of particles and the hand model's own error, of the wrist, not the pivot."""
     mean = on_device(filtered.mean, model.device)
