@@ -205,15 +205,9 @@ def test_of_more_than_two_hands_the_finder_sees_what_no_track_explains(
     np.testing.assert_array_equal(detector.images[0][~mine], IMAGE.depth_m[~mine])
 
 
-@pytest.mark.parametrize(
-    ("refused", "expected"), [(np.zeros((0, 4)), [("left", 0.3)]), ([[*at(FOUND[1]), 0.2]], [])]
-)
-def test_what_is_a_track_s_or_was_no_hand_a_moment_ago_is_not_looked_at(
-    refused: object, expected: list[tuple[str, float]]
-) -> None:
-    places = places_of(*FOUND)
-    _, seen, _ = looked(known(), found=FOUND, places=places, refused=np.array(refused))
-    assert elsewhere(seen) == expected
+def test_what_is_a_track_s_is_not_looked_at() -> None:
+    _, seen, _ = looked(known(), found=FOUND, places=places_of(*FOUND))
+    assert elsewhere(seen) == [("left", 0.3)]
 
 
 def test_where_frames_are_rare_hands_are_looked_for_where_the_tracks_are_as_well() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 from helpers.configured import confidence_model
@@ -27,7 +26,7 @@ from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
 from toftrack.tracking.filter import predict_particles
 from toftrack.tracking.report import TrackResult
-from toftrack.tracking.state import REFUSED_S, ParticleSet, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, Track, TrackerState
 from toftrack.tracking.step import filter_tracks, step, update_track
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -200,23 +199,16 @@ def test_of_tracks_on_one_hand_the_surest_goes_on(
     assert numbers(*tracks) == left
 
 
-def test_what_nobody_sees_ends_and_a_thing_is_left_alone_for_a_while() -> None:
+def test_what_nobody_sees_ends_whether_it_was_a_hand_or_not() -> None:
     long = Duration(1.0)
     state = going_on(track_of(HERE, doubtful=long), track_of(THERE, doubtful=long, **NEW))
-    assert state.tracks == () and len(state.refused) == 1, "what was a hand may come back"
-    place = detection_of(THERE).centre_m.numpy()
-    assert state.refused[0] == pytest.approx([*place, 0.0], abs=0.01)
-    state = replace(state, timestamp_s=0.0)
-    for passed, expected in ((0.9, 1), (1.1, 0)):
-        later = state.at(replace(IMAGE, timestamp_s=passed * REFUSED_S))
-        assert len(later.refused) == expected
+    assert state.tracks == ()
 
 
 def test_a_tentative_track_ends_beside_a_confirmed_one_but_not_alone() -> None:
     waiting = track_of(THERE, confirmed=False, age=Duration(0.6))
     assert numbers(SURE, waiting) == [0] and numbers(waiting) == [0]
     assert numbers(waiting, track_of(HERE, confirmed=False)) == [0, 1]
-    assert np.isfinite(going_on(SURE, waiting).refused).all()
 
 
 def test_time_goes_on_with_the_images_and_not_where_a_clock_goes_back() -> None:

@@ -152,7 +152,7 @@ def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
 
 
 def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
-    """The state with the tracks that go on, one a hand; tentative ones that end are refused."""
+    """The state with the tracks that go on, one a hand."""
     confirmed = sum(track.confirmed for track in tracks)
     ended = {
         track.number
@@ -172,14 +172,5 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
             joints = (hands[row].refiner.joints(tracks[row].pose)[0] for row in (first, second))
             if same_hand(apart, *joints):
                 ended.add(tracks[second].number)
-    refused = [
-        [*palm, 0.0]
-        for track, palm in zip(tracks, palms, strict=True)
-        if track.number in ended and not track.confirmed
-    ]
     kept = [track for track in tracks if track.number not in ended]
-    return changed(
-        state,
-        tracks=tuple(sorted(kept, key=lambda track: track.number)),
-        refused=np.concatenate((state.refused, np.reshape(refused, (-1, 4)))),
-    )
+    return changed(state, tracks=tuple(sorted(kept, key=lambda track: track.number)))

@@ -84,7 +84,7 @@ def finish_detection(
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
-    places = _apart_from([*known, *state.refused[:, :3]], places)
+    places = _apart_from(known, places)
     if len(places.centre_m):
         arms = [] if rare else _arms(scene, seen)
         found = _elsewhere(scene, state, places, rare)

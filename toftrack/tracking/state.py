@@ -146,7 +146,6 @@ class TrackerState:
     tracks: in the order in which they began.  slots: as many as hands are asked for.
     told: the side of the first slot that the user said; None = nobody did.
     places: the finder's in the last frame, used in the next.  found_s: since it was last asked.
-    refused: (R, 4) palms of tentative tracks that ended, m, and how long ago that was, s.
     next_track, next_index: numbers of the next track, and of the next frame without one.
     timestamp_s: of the last frame, None before any.
     """
@@ -157,7 +156,6 @@ class TrackerState:
     tracks: tuple[Track, ...] = ()
     places: Places = NO_PLACES
     found_s: float = math.inf
-    refused: np.ndarray = field(default_factory=lambda: np.zeros((0, 4)))
     next_track: int = 0
     next_index: int = 0
     timestamp_s: float | None = None
@@ -178,12 +176,10 @@ class TrackerState:
         """The state with its clocks at the time of an image; its tracks as they were."""
         before = image.timestamp_s if self.timestamp_s is None else self.timestamp_s
         passed = max(0.0, image.timestamp_s - before)
-        refused = self.refused + np.array([0.0, 0.0, 0.0, passed])
         return changed(
             self,
             slots=tuple(changed(slot, away_s=slot.away_s + passed) for slot in self.slots),
             found_s=self.found_s + passed,
-            refused=refused[refused[:, 3] < REFUSED_S],
             next_index=image.index + 1,
             timestamp_s=image.timestamp_s,
         )
@@ -193,10 +189,6 @@ class TrackerState:
         made = torch.Generator()
         made.set_state(self.generator)
         return made
-
-
-REFUSED_S = 1.5
-"""No track begins for so long where a tentative one ended."""
 
 
 @dataclass(frozen=True, eq=False)
