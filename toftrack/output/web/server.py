@@ -312,6 +312,8 @@ class _Connection(ServerConnection):
         self._owner, self._unread_bytes = owner, 0
 
     def connection_made(self, transport: Any) -> None:
+        # What is read at a time is parsed before others get a turn: thousands of messages.
+        transport.max_size = _MOST_RECEIVED_BYTES
         super().connection_made(transport)
         self._owner.opened(self)
 
