@@ -179,6 +179,12 @@ def test_a_client_that_pings_and_never_reads_is_cut_off(stream: WebSocketStream)
     eventually(lambda: not stream._server.clients)
 
 
+def test_a_host_that_can_be_no_name_is_one_sentence_and_leaves_no_thread() -> None:
+    with pytest.raises(ToftrackError, match=r"nothing can be served at stream.host=a\.\.b"):
+        websocket_stream(host="a..b").__enter__()
+    assert ours() == []
+
+
 def test_who_sends_without_end_does_not_keep_others_waiting(
     stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -152,9 +152,10 @@ class WebServer:
         self._thread.start()
         try:
             self._server: Server = self.begin(self._serve(port)).result()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a name that cannot be one
             self._end_thread()
-            raise _refused(group, host, port, error) from error
+            of_system = error if isinstance(error, OSError) else OSError(str(error))
+            raise _refused(group, host, port, of_system) from error
         at, port = next(iter(self._server.sockets)).getsockname()[:2]
         self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
         """Of the first page."""
