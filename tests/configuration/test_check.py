@@ -243,3 +243,32 @@ def test_aliases_and_anchors_of_usual_size_are_read(tmp_path: Path) -> None:
     (tmp_path / "stream" / "mine.yaml").write_text(text)
     stream = configuration("stream=mine", config_dir=tmp_path).stream
     assert stream.c == [{"one": [1, 2], "two": [1, 2]}] * 2
+
+
+@pytest.mark.parametrize(
+    "first, doubled",
+    [("''", "${v{0}}${v{0}}"), ("[1]", "[${v{0}},${..v{0}}]"), ("x", "${oc.select:v{0}}${v{0}}")],
+    ids=["texts", "lists", "resolvers"],
+)
+@pytest.mark.parametrize("run", [False, True])
+def test_interpolations_that_grow_by_one_another_are_refused_at_once(
+    first: str, doubled: str, run: bool, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    rising = [f"+v{i}='{doubled.replace('{0}', str(i - 1))}'" for i in range(1, 29)]
+    overrides = [f"+v0={first}", *(one.replace("'", "") if "[" in one else one for one in rising)]
+    if run:
+        folder = tmp_path / "runs"
+        assert main(["track", *overrides, f"hydra.run.dir={folder}/${{v28}}"]) == 1
+        said = capsys.readouterr().err
+        assert not folder.exists()
+    else:
+        with pytest.raises(ToftrackError) as error:
+            configuration(*overrides)
+        said = str(error.value)
+    assert "interpolations (${...}) make the configuration too large" in said
+    assert said.count("\n") == run
+
+
+def test_interpolations_that_refer_to_each_other_now_and_then_are_none_too_many() -> None:
+    overrides = ["+a=${hand.side}", "+b=${a} ${a}", "+c=[${b},${likelihood}]", "hand.side=left"]
+    assert configuration(*overrides).b == "left left"

@@ -12,7 +12,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
@@ -134,6 +134,26 @@ def test_a_reader_that_never_reads_stops_nothing(
     assert sent + dropped == 300 and dropped > 100
 
 
+def test_a_terminal_that_stands_still_stops_nothing() -> None:
+    main, terminal = os.openpty()
+    before = os.dup(1)
+    os.dup2(terminal, 1)
+    alarm = threading.Timer(10, os.close, (main,))  # lets go of what hangs
+    alarm.start()
+    try:
+        with stdout_stream(waiting=1) as stream:
+            for i in range(60):
+                stream.send((estimate(i),))
+            assert stream.dropped > 10 and alarm.is_alive()
+        assert os.get_blocking(1)
+    finally:
+        alarm.cancel()
+        os.dup2(before, 1)
+        for descriptor in (before, main, terminal):
+            with suppress(OSError):
+                os.close(descriptor)
+
+
 def test_a_reader_that_goes_away_is_reported_at_once() -> None:
     with piped() as pipe:
         with pytest.raises(ReaderGoneError, match="Broken pipe"), stdout_stream() as stream:
@@ -196,6 +216,7 @@ def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame()
         (["stream=udp", "stream.port=0"], "stream.port=0"),
         (["stream=udp", "stream.host=" + "a" * 70], "stream.host=aaa"),
         (["stream=udp", "stream.fields=[joints]"], "'joints'"),
+        (["stream=udp", "stream.fields=5"], "unknown field 5"),
         (["stream=stdout", "stream.fields=[]"], "stream.fields is empty"),
         (["stream=stdout", "stream.waiting=0"], "stream.waiting=0"),
     ],

@@ -130,6 +130,9 @@ def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
     notes = [line for line in err.splitlines() if line.startswith("note: ")]
     assert notes[1].startswith("note: First see to what was doubted: nearly all readings are")
     assert all(note.startswith("note: If that is as it should be: ") for note in notes[2:])
+    np.savez(tmp_path / "wall.npz", depth_m=np.full_like(wall, 1.6), K=K)
+    _, _, err = here("device=replay", "device.path=wall.npz", "view=none")
+    assert re.search(r"note: First see to what was doubted: .*was it saved whole\?\n", err)
 
 
 def test_what_is_logged_meanwhile_stands_on_a_line_of_its_own(here, tmp_path: Path) -> None:

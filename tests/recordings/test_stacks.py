@@ -20,7 +20,7 @@ from toftrack.api import make_device
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert
-from toftrack.recordings import matlab
+from toftrack.recordings import matlab, stacks
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.matlab import read_matlab
@@ -114,6 +114,21 @@ def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
     np.testing.assert_allclose(store.image(3)[0], METRES[3], atol=1e-6)
     with pytest.raises(ToftrackError, match="frame 4 of '.*' cannot be read"):
         store.image(4)
+
+
+def test_a_npy_in_fortran_order_stays_as_it_was_when_the_file_shrinks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "a.npy"
+    np.save(path, np.asfortranarray(WORDS))
+    store = opened(path)
+    os.truncate(path, path.stat().st_size - HEIGHT * WIDTH * 2)
+    for number in range(COUNT):
+        np.testing.assert_allclose(store.image(number)[0], METRES[number], atol=1e-6)
+    np.save(path, np.asfortranarray(WORDS))
+    monkeypatch.setattr(stacks, "MOST_BYTES", WORDS.nbytes - 1)
+    with pytest.raises(ToftrackError, match="numpy.ascontiguousarray"):
+        opened(path)
 
 
 @pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])

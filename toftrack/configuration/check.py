@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Sequence
+from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -50,6 +51,9 @@ _AT_MOST = {"hands": MOST_HANDS, "filter.particles": 100_000, "filter.passes": 1
 """More particles or passes than these take minutes a frame; larger seeds are none for torch."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
+MOST_VALUES = 5000
+"""In a configuration, or a file of one, an interpolation or alias counted as what it stands for;
+Hydra takes two seconds for so many."""
 _LOG_ODDS = ("detector.merit",)
 """How the settings begin that may be below 0."""
 _MAY_BE_NONE = frozenset({"data.poses", "device.persistence.give_up_s"})
@@ -77,6 +81,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
 
     name: of the configuration file.  overrides: of the command line.
     """
+    check_interpolations(config)
     check_tracker(config)
     space = config.get("pose_space") or {}
     of_file = space.get("file") is not None and str(space.get("_target_")).startswith("toftrack.")
@@ -97,6 +102,40 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
         return  # options that exclude each other unless something is deleted: nothing to compare
     for key, value, usual in _pairs(config, default):
         _check_value(key, value, usual)
+
+
+def check_interpolations(config: DictConfig) -> None:
+    """Raise ToftrackError where interpolations of interpolations, as `b: ${a}${a}`, `c: ${b}${b}`,
+    make a large configuration of a small one: OmegaConf resolves each anew wherever it stands.
+    """
+    plain: Any = OmegaConf.to_container(config)
+    sizes: dict[tuple[str, ...], int] = {}
+
+    def size(path: tuple[str, ...]) -> int:
+        """Values of a setting or a group, 0 where there is none of that path."""
+        if path in sizes:
+            return sizes[path]
+        sizes[path] = 0  # of a circle, which OmegaConf tells of
+        value, inner = plain, []
+        try:
+            for key in path:
+                value = value[int(key) if isinstance(value, list) else key]
+        except (LookupError, TypeError, ValueError):
+            return 0
+        if isinstance(value, dict | list):
+            keys = value if isinstance(value, dict) else range(len(value))
+            inner = [(*path, str(key)) for key in keys]
+        elif "${" in str(value):  # each word that is a setting's may be asked for
+            for dots, words in re.findall(r"(\.*)(\w[\w.[\]]*)", str(value)):
+                inner.append((*path[: -len(dots) or -len(path)], *re.findall(r"\w+", words)))
+        sizes[path] = 1 + sum(map(size, inner))
+        return sizes[path]
+
+    if size(()) > MOST_VALUES:
+        raise ToftrackError(
+            "interpolations (${...}) make the configuration too large, as they stand for one "
+            f"another (for at most {MOST_VALUES} values in all); write what they stand for"
+        )
 
 
 def check_groups(config: DictConfig) -> None:

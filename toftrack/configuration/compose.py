@@ -20,14 +20,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.check import check_overrides
+from toftrack.configuration.check import MOST_VALUES, check_overrides
 from toftrack.configuration.plugins import import_from, offer_installed
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
 _ROOT = "config.yaml"
-_MOST_LETTERS, _MOST_VALUES = 2**16, 5000
-"""In a file of the configuration; Hydra takes two seconds for so many."""
+_MOST_LETTERS = 2**16
+"""In a file of the configuration."""
 _composing = threading.Lock()
 
 
@@ -168,10 +168,10 @@ def _check_size(file: Any) -> None:
                 count += sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
                 if isinstance(event, yaml.CollectionStartEvent):
                     within.append((event.anchor, count))
-            if count > _MOST_VALUES or len(text) > _MOST_LETTERS:
+            if count > MOST_VALUES or len(text) > _MOST_LETTERS:
                 raise ToftrackError(
                     f"'{file.name}' is too large for a file of the configuration (at most "
-                    f"{_MOST_VALUES} values, aliases counted as what they stand for); let your "
+                    f"{MOST_VALUES} values, aliases counted as what they stand for); let your "
                     "part read a file of its own"
                 )
 

@@ -24,8 +24,8 @@ from toftrack.output.lines import LINE_FIELDS, json_line
 _log = logging.getLogger(__name__)
 
 _STDOUT, _STDERR = 1, 2
-_GRACE_S = 1.0
-"""How long the lines that still wait at the end have to leave."""
+_GRACE_S, _PAUSE_S = 1.0, 0.01
+"""How long the lines that still wait at the end have to leave; between attempts."""
 
 
 class ReaderGoneError(Exception):
@@ -84,7 +84,11 @@ class StdoutStream(Stream):
         ):
             if sys.stdout is not None:
                 sys.stdout.flush()
-            self._descriptor = os.dup(_STDOUT)
+            self._descriptor = self._stdout = os.dup(_STDOUT)
+        if os.isatty(_STDOUT):  # whose room nothing tells
+            with suppress(OSError):  # it has no name here
+                flags = os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK
+                self._descriptor = os.open(os.ttyname(_STDOUT), flags)
         os.dup2(_STDERR, _STDOUT)
         return self
 
@@ -108,8 +112,9 @@ class StdoutStream(Stream):
         with suppress(OSError):  # nobody reads the last lines
             self._write(until=time.monotonic() + _GRACE_S)
         sys.stdout.flush()
-        os.dup2(self._descriptor, _STDOUT)
-        os.close(self._descriptor)
+        os.dup2(self._stdout, _STDOUT)
+        for descriptor in {self._stdout, self._descriptor}:
+            os.close(descriptor)
         self.dropped += len(self._lines) + bool(self._rest)
         self.report("to standard output", "the reader was too slow")
 
@@ -124,7 +129,13 @@ class StdoutStream(Stream):
                 return
             # So much is sure to fit in; the pipe's own non-blocking mode would be that of all the
             # programs that share it.
-            count = os.write(self._descriptor, self._rest[: select.PIPE_BUF])
+            try:
+                count = os.write(self._descriptor, self._rest[: select.PIPE_BUF])
+            except BlockingIOError:  # of a terminal
+                if not patience:
+                    return
+                count = 0
+                time.sleep(_PAUSE_S)
             self._rest = self._rest[count:]
             self.sent += not self._rest
 
@@ -176,7 +187,8 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
     """The fields that a setting names, of lines.LINE_FIELDS; ToftrackError for an unknown one."""
     if fields is None:
         return LINE_FIELDS
-    names = (fields,) if isinstance(fields, str) else tuple(fields)
+    one = isinstance(fields, str) or not isinstance(fields, Sequence)
+    names: tuple[Any, ...] = (fields,) if one else tuple(fields)
     unknown = [name for name in names if name not in LINE_FIELDS]
     if unknown or not names:
         what = f"names the unknown field {unknown[0]!r}" if unknown else "is empty"

@@ -25,7 +25,7 @@ from hydra.experimental.callback import Callback
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from toftrack.configuration.check import check_overrides
+from toftrack.configuration.check import check_interpolations, check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, place_of, sentence
 from toftrack.errors import ToftrackError
 from toftrack.files.json_text import read_object
@@ -225,6 +225,10 @@ class FailedJobs(Callback):
 
 
 def _given(config: DictConfig, kind: str) -> Path:
+    try:
+        check_interpolations(config)
+    except ToftrackError as large:
+        raise _JobFailedError(large) from large
     if not (folder := config.hydra[kind].dir):  # which would be the current one
         error = ToftrackError(f"hydra.{kind}.dir is empty; give a folder, or . for the current one")
         raise _JobFailedError(error)

@@ -168,7 +168,7 @@ class Run:
         if advice[1:] and (doubts := self.device.description.get("doubts")):
             # What there is to try may contradict it: hold nearer what is of another unit.
             advised = (f"If that is as it should be: {more}" for more in advice[1:])
-            advice = advice[0], f"First see to what was doubted: {doubts[0]}.", *advised
+            advice = advice[0], f"First see to what was doubted: {doubts[0]}", *advised
         return dropped + advice
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.files.archives import MOST_BYTES
 from toftrack.files.safe_files import open_to_read
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_metres, size_of
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
@@ -110,8 +111,14 @@ def _reported(path: Path, what: str = "") -> Iterator[None]:
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
     with _reported(path):
         images = np.lib.format.open_memmap(path, mode="r")
-    stacked = images[None] if images.ndim == 2 else images
-    return (_Npy(path, stacked, images.offset) if stacked.flags.c_contiguous else stacked), _PYTHONS
+        stacked = images[None] if images.ndim == 2 else images
+        if stacked.flags.c_contiguous:
+            return _Npy(path, stacked, images.offset), _PYTHONS
+        # An image's numbers lie all over the file.
+        if images.nbytes > MOST_BYTES:
+            raise ValueError("it is larger than a gigabyte: save it with numpy.ascontiguousarray")
+        with open_to_read(path) as stream:
+            return np.load(stream, allow_pickle=False).reshape(stacked.shape), _PYTHONS
 
 
 class _Npy:

@@ -7,9 +7,10 @@ import json
 import logging
 import re
 import socket
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,7 +23,7 @@ from websockets.sync import client
 
 from toftrack.errors import ToftrackError
 from toftrack.output.lines import json_line
-from toftrack.output.web.server import MOST_HALF_OPEN
+from toftrack.output.web.server import MOST_HALF_OPEN, Client
 from toftrack.output.web.stream import WebSocketStream
 
 
@@ -176,6 +177,35 @@ def test_a_client_that_pings_and_never_reads_is_cut_off(stream: WebSocketStream)
             for _ in range(50):  # the system keeps some, too
                 mute.sendall(pings)
     eventually(lambda: not stream._server.clients)
+
+
+def test_a_host_that_can_be_no_name_is_one_sentence_and_leaves_no_thread() -> None:
+    with pytest.raises(ToftrackError, match=r"nothing can be served at stream.host=a\.\.b"):
+        websocket_stream(host="a..b").__enter__()
+    assert ours() == []
+
+
+def test_who_sends_without_end_does_not_keep_others_waiting(
+    stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[object] = []
+    monkeypatch.setattr(Client, "receive", lambda _, message: taken.append(message))
+
+    def flood(loud: socket.socket) -> None:
+        with suppress(OSError):
+            while True:
+                loud.sendall((b"\x81\x80" + bytes(4)) * 4000)  # empty messages
+
+    with socket.socket() as loud:
+        listen(loud, stream)
+        sender = threading.Thread(target=flood, args=(loud,))
+        sender.start()
+        eventually(lambda: len(taken) > 50_000)  # much waits by now
+        before = len(taken)
+        assert answer(stream, "/")[0] == 200
+        assert len(taken) - before < 20_000
+        loud.shutdown(socket.SHUT_RDWR)
+        sender.join()
 
 
 @pytest.mark.parametrize(

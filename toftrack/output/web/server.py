@@ -152,9 +152,10 @@ class WebServer:
         self._thread.start()
         try:
             self._server: Server = self.begin(self._serve(port)).result()
-        except OSError as error:
+        except (OSError, ValueError) as error:  # a name that cannot be one
             self._end_thread()
-            raise _refused(group, host, port, error) from error
+            of_system = error if isinstance(error, OSError) else OSError(str(error))
+            raise _refused(group, host, port, of_system) from error
         at, port = next(iter(self._server.sockets)).getsockname()[:2]
         self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
         """Of the first page."""
@@ -312,6 +313,8 @@ class _Connection(ServerConnection):
         self._owner, self._unread_bytes = owner, 0
 
     def connection_made(self, transport: Any) -> None:
+        # What is read at a time is parsed before others get a turn: thousands of messages.
+        transport.max_size = _MOST_RECEIVED_BYTES
         super().connection_made(transport)
         self._owner.opened(self)
 
