@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import roma
 import torch
-from helpers.configured import detector_settings
 from helpers.detection import small_networks
+from helpers.settings import detector_settings
 from helpers.tracking import sample
 
 from toftrack.compute.rigid import PIVOT_M

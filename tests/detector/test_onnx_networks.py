@@ -11,8 +11,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from helpers.configured import detector_settings
 from helpers.detection import small_networks
+from helpers.settings import detector_settings
 from helpers.tracking import sample
 
 from toftrack.detector import onnx_networks

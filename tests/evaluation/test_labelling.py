@@ -12,7 +12,7 @@ from toftrack.configuration.compose import configuration
 from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, read_labels
-from toftrack.evaluation.labelling import LABELLED, LabelFile, chosen_frames, label_frames, track
+from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
 
 ABSENT = [None, None, "absent"]
 
@@ -179,7 +179,3 @@ def test_without_a_hand_the_whole_image_is_shown(tmp_path) -> None:
 def test_a_part_of_a_recording_is_refused() -> None:
     with pytest.raises(ToftrackError, match="leave out device.start"):
         label_frames(Sample(start=3, stop=6), configuration(), [1])
-
-
-def test_eleven_joints_are_asked_for() -> None:
-    assert len(LABELLED) == 11 and LABELLED[0] == "thumb_tip" and LABELLED[-1] == "wrist"

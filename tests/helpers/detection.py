@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 import torch
-from helpers.configured import detector_settings
+from helpers.settings import detector_settings
 from torch import nn
 
 from toftrack.compute.rigid import rotated_pivot

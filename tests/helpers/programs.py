@@ -7,8 +7,10 @@ import logging
 import os
 import runpy
 import signal
+import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
@@ -80,3 +82,17 @@ def interrupted_when(ready: Callable[[], object]) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+
+
+def killed_when(ready: Callable[[], object], *words: str) -> None:
+    """`toftrack WORDS` in a process of its own gets kill -9 as soon as `ready` says so."""
+    quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    process = subprocess.Popen([sys.executable, "-m", "toftrack", *words], cwd=ROOT, **quiet)
+    try:
+        deadline = time.monotonic() + 60
+        while not ready():
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.02)
+    finally:
+        process.kill()
+        process.wait()

@@ -10,6 +10,8 @@ from helpers.tracking import configuration
 from hydra.utils import get_object, instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from toftrack.detector.hand_detector import DetectorSettings
+
 
 @cache
 def _node(choice: str, key: str) -> DictConfig:
@@ -50,3 +52,16 @@ stdout_stream = partial(part, "stream=stdout", "stream")
 udp_stream = partial(part, "stream=udp", "stream")
 gestures = partial(part, "gestures=default", "gestures")
 browser_view = partial(part, "view=browser", "view")
+nearest_surface = partial(part, "segmentation=nearest", "segmentation")
+f_measure = partial(part, "likelihood=f_measure", "likelihood")
+refinement = partial(part, "refine=gauss_newton", "refine")
+posterior_weights = partial(part, "posterior=default", "posterior")
+confidence_model = partial(part, "lost=calibrated", "lost")
+rough_start = partial(part, "experiment=paper", "start")
+
+
+def detector_settings(**changes: Any) -> DetectorSettings:
+    """conf/detector/network.yaml, without its weights"""
+    given = values("detector=network", "detector") | changes
+    del given["weights"]
+    return DetectorSettings(**given)

@@ -133,20 +133,6 @@ def test_a_reader_without_this_package_can_draw_the_hand_into_the_image(tmp_path
     assert np.allclose(parts[:, 0], run["landmarks"][0, :, 0], atol=1e-5)
 
 
-def test_read_results_gives_back_what_was_appended(tmp_path: Path) -> None:
-    estimates = [estimate(i) for i in range(3)]
-    write(tmp_path, estimates)
-    content = read_results(tmp_path / "track.npz")
-    assert content["joint_names"] == NAMES
-    assert content["metadata"] == {"seed": 1}
-    for row, one in enumerate(estimates):
-        same = ("joints_m", "state", "latent", "covariance", "lost", "gesture", "index")
-        for name in (*same, "state_name", "side"):
-            np.testing.assert_array_equal(content[name][row], getattr(one, name))
-        for name in ("score", "confidence", "outside_rad", "side_probability"):
-            assert content[name][row] == pytest.approx(getattr(one, name))
-
-
 def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
     writer = ResultWriter(tmp_path, {}, NAMES, None)
     for i in range(3):
@@ -331,37 +317,17 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
     assert many - few < 200 * 200  # a frame's numbers alone are 1100 bytes
 
 
-def recovered(folder: Path, summary: dict[str, Any] | None) -> dict[str, Any]:
-    """What was written, which is recovered from the lines as it was."""
-    before = read_results(folder / "track.npz")
-    for name in ("track.npz", "summary.json"):
-        (folder / name).unlink()
-    assert json.dumps(recover(folder)) == json.dumps(summary)  # NaN, too
-    after = read_results(folder / "track.npz")
-    for name in KINDS:
-        np.testing.assert_array_equal(after[name], before[name])
-    return before
-
-
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
     odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
     many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
-    recovered(tmp_path, write(tmp_path, many).summary)
-
-
-def test_three_slots_are_written_and_recovered(tmp_path: Path) -> None:
-    facts = {"config": {"hands": 3}}
-    with ResultWriter(tmp_path, facts, NAMES) as writer:
-        for i in range(4):
-            vacant = no_estimate(i, 0.04 * i, "searching", 4, 0.01)
-            there = estimate(i, lost=False, side="left")
-            writer.append((vacant, there, there if i else vacant))
-    lines = lines_of(tmp_path)
-    assert [[hand["slot"] for hand in line["hands"]] for line in lines] == [[1], *[[1, 2]] * 3]
-    content = recovered(tmp_path, writer.summary)
-    assert content["joints_m"].shape == (4, 3, 21, 3) and content["timestamp_s"].shape == (4,)
-    assert content["lost"].tolist() == [[True, False, True], *[[True, False, False]] * 3]
-    assert content["side"][3, 2] == "left" and np.isnan(content["joints_m"][:, 0]).all()
+    summary, before = write(tmp_path, many).summary, read_results(tmp_path / "track.npz")
+    assert before["joint_names"] == NAMES and before["metadata"] == {"seed": 1}
+    for name in ("track.npz", "summary.json"):
+        (tmp_path / name).unlink()
+    assert json.dumps(recover(tmp_path)) == json.dumps(summary)  # NaN, too
+    after = read_results(tmp_path / "track.npz")
+    for name in KINDS:
+        np.testing.assert_array_equal(after[name], before[name])
 
 
 @pytest.mark.parametrize(

@@ -253,5 +253,5 @@ def test_a_file_that_is_missing_or_no_archive_is_one_clear_error(tmp_path) -> No
 
 def test_a_model_of_another_size_than_configured_is_refused(tmp_path) -> None:
     save_pose_space(fitted("pca", 3), tmp_path / "model.npz")
-    with pytest.raises(ToftrackError, match="pose_space.dims=3"):
+    with pytest.raises(ToftrackError, match="3-dimensional.*pose_space.dims=3"):
         make_pose_space("pca", 4, str(tmp_path / "model.npz"))

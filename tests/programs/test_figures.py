@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import torch
 from helpers import programs
-from helpers.configured import f_measure, nearest_surface
 from helpers.programs import QUICK
+from helpers.settings import f_measure, nearest_surface
 from helpers.tracking import ROOT, make_tracker, sample
 
 from toftrack.errors import ToftrackError

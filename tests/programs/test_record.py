@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from helpers.fake_orbbec import DEPTH, IR, Images, Sdk, image, profile
 from helpers.fake_orbbec import Camera as FakeCamera
-from helpers.programs import QUICK, interrupted_when
+from helpers.programs import QUICK, interrupted_when, killed_when
 from helpers.settings import orbbec, realsense, realsense_emulator, sr3000, sr3000_emulator
-from helpers.tracking import ROOT, run
+from helpers.tracking import run
 
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.realsense.device import load_sdk
@@ -242,18 +237,8 @@ def test_after_kill_9_the_frames_until_then_are_recovered(
 ) -> None:
     path, part = tmp_path / "hand.npz", tmp_path / "hand.npz.part"
     settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
-    command = [sys.executable, "-m", "toftrack", "record", str(path), *settings]
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    process = subprocess.Popen([*command, "device.emulated.loop=true"], cwd=ROOT, **quiet)
-    try:
-        deadline = time.monotonic() + 60
-        while not sized(part, 2_000_000):
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
+    record_it = ("record", str(path), *settings, "device.emulated.loop=true")
+    killed_when(lambda: sized(part, 2_000_000), *record_it)
     size = part.stat().st_size
     recover.main([str(path)])
     replay = Replay(path)

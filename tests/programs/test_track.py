@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import pickle
 import re
 import shutil
 import signal
@@ -24,14 +23,11 @@ from helpers.programs import QUICK
 from helpers.tracking import ROOT
 from helpers.videos import video_frames
 
-from toftrack.devices.replay import Replay
-from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.run_folder import read_run
-from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.export import export
 from toftrack.programs.figures import draw_figures
 from toftrack.programs.recover import recover
@@ -238,39 +234,6 @@ def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     one, two = (read_results(tmp_path / "sweep" / n / "track.npz") for n in ("0", "1"))
     assert (one["metadata"]["seed"], two["metadata"]["seed"]) == (1, 2)
     assert not np.array_equal(one["joints_m"], two["joints_m"])
-
-
-def test_a_pickle_by_itself_is_refused_and_not_loaded(tmp_path) -> None:
-    class Trap:
-        def __reduce__(self) -> tuple:
-            return Path.touch, (tmp_path / "sprung",)
-
-    np.savez(tmp_path / "bad.npz", K=K, depth_m=np.array([Trap()], object))
-    (tmp_path / "plain.npz").write_bytes(pickle.dumps(Trap()))
-    for file in ("bad.npz", "plain.npz"):
-        with pytest.raises(ToftrackError, match=file):
-            Replay(tmp_path / file)
-    assert not (tmp_path / "sprung").exists()
-
-
-def test_a_pose_space_file_of_another_size_or_version_is_one_clear_sentence(here, tmp_path) -> None:
-    def reported(path: str | Path) -> str:
-        with pytest.raises(ToftrackError) as error:
-            load_pose_space(path)
-        return str(error.value)
-
-    small, newer = tmp_path / "small.npz", tmp_path / "newer.npz"
-    save_pose_space(fit_pose_space("pca", 3), small)
-    with np.load(small) as archive:
-        arrays = dict(archive)
-    arrays["header"] = np.array(str(arrays["header"]).replace('"version": 1', '"version": 99'))
-    np.savez(newer, **arrays)
-    assert "version 99" in reported(newer)
-    assert "no pose-space file" in reported(tmp_path / "gone.npz")
-    assert "not a pose-space file" in reported(__file__)
-    status, _, err = here("pose_space.file=small.npz")
-    assert status == 1 and "3-dimensional" in err and "pose_space.dims=3" in err
-    assert err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import pickle
 import re
 import zipfile
 from collections.abc import Callable
@@ -211,6 +212,8 @@ def test_pickled_objects_are_refused(tmp_path: Path, key: str) -> None:
     text = complaint(path)
     assert "pickled" in text
     assert key in text
+    path.write_bytes(pickle.dumps(Canary()))
+    assert "it is no .npz archive" in complaint(path)
     assert not Canary.woken
 
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import struct
 import subprocess
 import sys
-import time
 import tracemalloc
 from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.programs import killed_when
 
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
@@ -214,7 +212,7 @@ def test_a_full_disk_is_reported_and_the_whole_frames_are_kept(path: Path) -> No
     # In a process of its own, whose files may not become larger than two frames and a half.
     program = f"""
 import resource, sys
-sys.path.insert(0, {str(Path(__file__).parent)!r})
+sys.path[:0] = {[str(folder) for folder in Path(__file__).parents[:2]]!r}
 from pathlib import Path
 import test_srs
 from toftrack.errors import ToftrackError
@@ -239,20 +237,11 @@ def test_a_link_to_a_device_is_not_written(tmp_path: Path) -> None:
 
 
 def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
-    command = [sys.executable, "-m", "toftrack", "record", str(path)]
-    options = ["device.transport=emulated", "device.emulated.fps=200", "device.emulated.loop=true"]
-    process = subprocess.Popen(
-        command + options, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    settings = ("device.transport=emulated", "device.emulated.fps=200", "device.emulated.loop=true")
+    size = 30 * FRAME_BYTES
+    killed_when(
+        lambda: path.exists() and path.stat().st_size > size, "record", str(path), *settings
     )
-    try:
-        deadline = time.monotonic() + 30
-        while not (path.exists() and path.stat().st_size > 30 * FRAME_BYTES):
-            assert process.poll() is None
-            assert time.monotonic() < deadline
-            time.sleep(0.02)
-    finally:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
     recording, sample = read_srs(path), Path(__file__).parents[2] / "toftrack/data/sample.npz"
     truth = read_recording(sample)
     lengths = np.sqrt(1 + (truth.camera.normalised_rays() ** 2).sum(-1)).astype(np.float32)

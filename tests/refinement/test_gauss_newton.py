@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from helpers.configured import nearest_surface, refinement
+from helpers.settings import nearest_surface, refinement
 from helpers.tracking import sample
 from reference.refinement import point_jacobian, refine
 from torch import Tensor

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import refinement
+from helpers.settings import refinement
 from reference.refinement import (
     Residuals,
     keypoint_residuals,

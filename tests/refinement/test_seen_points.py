@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import nearest_surface
+from helpers.settings import nearest_surface
 from helpers.tracking import sample
 
 from toftrack.refinement import seen_points as seen_points_of

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers import configured
-from helpers.configured import nearest_surface
+from helpers import settings
+from helpers.settings import nearest_surface
 from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
@@ -31,7 +31,7 @@ SHAPE = default_hand_shape()
 
 def f_measure(**changes: object) -> FMeasure:
     """The configured one, but as the paper has it: a pixel is correct or not, no coverage."""
-    return configured.f_measure(**{"residual_weight": 0.0, "coverage": 0.0} | changes)
+    return settings.f_measure(**{"residual_weight": 0.0, "coverage": 0.0} | changes)
 
 
 def hand_states(n: int, seed: int) -> torch.Tensor:

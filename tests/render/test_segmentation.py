@@ -7,7 +7,7 @@ import math
 import cv2
 import numpy as np
 import pytest
-from helpers.configured import nearest_surface
+from helpers.settings import nearest_surface
 from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError

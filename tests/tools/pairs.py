@@ -90,7 +90,8 @@ def properties_sheet(paths: list[Path], table: str) -> np.ndarray:
             of = file["K"].astype(float), file["joints_m"][row].astype(float)
             image = file["depth_m"][row].astype(np.float32)
         before, after = (Frame(image.copy(), *of, np.random.default_rng(n)) for _ in range(2))
-        PROPERTIES[name](after)
+        change, *numbers = PROPERTIES[name]
+        change(after, *numbers)
         cost = re.search(rf"\n\| {re.escape(name)} \|[^|]*\|[^|(]*\(([^)]*)\)", table)[1]
         tiles = (tile(f.depth_m, f.k, f.palm_m, np.eye(2)) for f in (before, after))
         pairs.append((*tiles, f"{name}: {cost}"))

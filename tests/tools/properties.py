@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -62,164 +62,112 @@ def _filled(depth: np.ndarray, far: float = 4.0) -> np.ndarray:
     return np.where(depth > 0, depth, np.float32(far)).astype(np.float32)
 
 
-def _edges(depth: np.ndarray, size: int = 3) -> np.ndarray:
+def _edges(depth: np.ndarray, size: int) -> np.ndarray:
     full = _filled(depth)
     window = np.ones((size, size), np.uint8)
     return cv2.dilate(full, window) - cv2.erode(full, window) > _JUMP_M
 
 
-def noise(sigma_m: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        some = f.rng.normal(0, sigma_m, f.depth_m.shape).astype(np.float32)
-        f.depth_m = np.where(f.depth_m > 0, f.depth_m + some, 0)
-
-    return change
+def noise(f: Frame, sigma_m: float) -> None:
+    some = f.rng.normal(0, sigma_m, f.depth_m.shape).astype(np.float32)
+    f.depth_m = np.where(f.depth_m > 0, f.depth_m + some, 0)
 
 
-def waves(sigma_m: float, scale_px: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        field = f.rng.normal(0, 1, f.depth_m.shape).astype(np.float32)
-        field = cv2.GaussianBlur(field, (0, 0), scale_px)
-        f.depth_m = np.where(f.depth_m > 0, f.depth_m + sigma_m * field / field.std(), 0)
-
-    return change
+def waves(f: Frame, sigma_m: float, scale_px: float) -> None:
+    field = f.rng.normal(0, 1, f.depth_m.shape).astype(np.float32)
+    field = cv2.GaussianBlur(field, (0, 0), scale_px)
+    f.depth_m = np.where(f.depth_m > 0, f.depth_m + sigma_m * field / field.std(), 0)
 
 
-def steps(step_m: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        f.depth_m = np.round(f.depth_m / step_m).astype(np.float32) * np.float32(step_m)
-
-    return change
+def steps(f: Frame, step_m: float) -> None:
+    f.depth_m = np.round(f.depth_m / step_m).astype(np.float32) * np.float32(step_m)
 
 
-def holes(share: float, size: int = 1) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        h, w = f.depth_m.shape
-        small = f.rng.random((h // size + 1, w // size + 1)) < share
-        f.depth_m = np.where(np.kron(small, np.ones((size, size)))[:h, :w] > 0, 0, f.depth_m)
-
-    return change
+def holes(f: Frame, share: float, size: int = 1) -> None:
+    h, w = f.depth_m.shape
+    small = f.rng.random((h // size + 1, w // size + 1)) < share
+    f.depth_m = np.where(np.kron(small, np.ones((size, size)))[:h, :w] > 0, 0, f.depth_m)
 
 
-def edges_lost(size: int) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        f.depth_m = np.where(_edges(f.depth_m, size), 0, f.depth_m)
-
-    return change
+def edges_lost(f: Frame, size: int) -> None:
+    f.depth_m = np.where(_edges(f.depth_m, size), 0, f.depth_m)
 
 
-def fat(size: int) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        near = cv2.erode(_filled(f.depth_m), np.ones((size, size), np.uint8))
-        f.depth_m = np.where(near < 3.9, near, 0)
-
-    return change
+def fat(f: Frame, size: int) -> None:
+    near = cv2.erode(_filled(f.depth_m), np.ones((size, size), np.uint8))
+    f.depth_m = np.where(near < 3.9, near, 0)
 
 
-def shadows(base_m: float) -> Callable[[Frame], None]:
+def shadows(f: Frame, base_m: float) -> None:
     """Structured light: what the projector, `base_m` to the right, does not see."""
-
-    def change(f: Frame) -> None:
-        depth = _filled(f.depth_m)
-        h, w = depth.shape
-        disparity = f.k[0, 0] * base_m / depth
-        # From the side of the projector on, a reading is seen if no nearer one covers its column.
-        target = np.arange(w)[None] - disparity
-        nearest = np.minimum.accumulate(target[:, ::-1], axis=1)[:, ::-1]
-        f.depth_m = np.where(target > np.roll(nearest, -1, 1) + 0.5, 0, f.depth_m)
-        f.depth_m[:, -1] = 0
-
-    return change
+    depth = _filled(f.depth_m)
+    h, w = depth.shape
+    disparity = f.k[0, 0] * base_m / depth
+    # From the side of the projector on, a reading is seen if no nearer one covers its column.
+    target = np.arange(w)[None] - disparity
+    nearest = np.minimum.accumulate(target[:, ::-1], axis=1)[:, ::-1]
+    f.depth_m = np.where(target > np.roll(nearest, -1, 1) + 0.5, 0, f.depth_m)
+    f.depth_m[:, -1] = 0
 
 
-def flying(size: int) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        full = _filled(f.depth_m, 2.0)
-        window = np.ones((size, size), np.uint8)
-        near, far = cv2.erode(full, window), cv2.dilate(full, window)
-        part = f.rng.random(full.shape) ** 2
-        mixed = near + part * np.minimum(far - near, 0.6)
-        f.depth_m = np.where(_edges(f.depth_m, size), mixed, f.depth_m)
-
-    return change
+def flying(f: Frame, size: int) -> None:
+    full = _filled(f.depth_m, 2.0)
+    window = np.ones((size, size), np.uint8)
+    near, far = cv2.erode(full, window), cv2.dilate(full, window)
+    part = f.rng.random(full.shape) ** 2
+    mixed = near + part * np.minimum(far - near, 0.6)
+    f.depth_m = np.where(_edges(f.depth_m, size), mixed, f.depth_m)
 
 
-def smoothed(size: int) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        kept = cv2.bilateralFilter(_filled(f.depth_m), size, 0.025, size / 2)
-        f.depth_m = np.where(f.depth_m > 0, kept, 0)
-
-    return change
+def smoothed(f: Frame, size: int) -> None:
+    kept = cv2.bilateralFilter(_filled(f.depth_m), size, 0.025, size / 2)
+    f.depth_m = np.where(f.depth_m > 0, kept, 0)
 
 
-def median(size: int) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        f.depth_m = cv2.medianBlur(f.depth_m.astype(np.float32), size)
-
-    return change
+def median(f: Frame, size: int) -> None:
+    f.depth_m = cv2.medianBlur(f.depth_m.astype(np.float32), size)
 
 
-def closed(size: int) -> Callable[[Frame], None]:
+def closed(f: Frame, size: int) -> None:
     """Small holes are filled with what is behind them."""
-
-    def change(f: Frame) -> None:
-        filled = cv2.dilate(f.depth_m.astype(np.float32), np.ones((size, size), np.uint8))
-        f.depth_m = np.where(f.depth_m > 0, f.depth_m, filled)
-
-    return change
+    filled = cv2.dilate(f.depth_m.astype(np.float32), np.ones((size, size), np.uint8))
+    f.depth_m = np.where(f.depth_m > 0, f.depth_m, filled)
 
 
-def hollows(factor: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        size = int(0.05 * f.k[0, 0] / f.palm_m[2]) | 1
-        ring = np.where(f.of_hand, f.depth_m, 9).astype(np.float32)
-        window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
-        front = cv2.dilate(cv2.erode(ring, window), window)  # opening: hollows are closed
-        deep = np.where(f.of_hand, np.clip(f.depth_m - front, 0, 0.05), 0)
-        f.depth_m = (f.depth_m + (factor - 1) * deep).astype(np.float32)
-
-    return change
+def hollows(f: Frame, factor: float) -> None:
+    size = int(0.05 * f.k[0, 0] / f.palm_m[2]) | 1
+    ring = np.where(f.of_hand, f.depth_m, 9).astype(np.float32)
+    window = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
+    front = cv2.dilate(cv2.erode(ring, window), window)  # opening: hollows are closed
+    deep = np.where(f.of_hand, np.clip(f.depth_m - front, 0, 0.05), 0)
+    f.depth_m = (f.depth_m + (factor - 1) * deep).astype(np.float32)
 
 
-def relief(factor: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        middle = f.palm_m[2]
-        f.depth_m = np.where(f.of_hand, middle + factor * (f.depth_m - middle), f.depth_m)
-
-    return change
+def relief(f: Frame, factor: float) -> None:
+    middle = f.palm_m[2]
+    f.depth_m = np.where(f.of_hand, middle + factor * (f.depth_m - middle), f.depth_m)
 
 
-def sized(factor: float) -> Callable[[Frame], None]:
+def sized(f: Frame, factor: float) -> None:
     """A smaller or larger hand: all of the world is, and stands as far away in proportion."""
-
-    def change(f: Frame) -> None:
-        f.depth_m, f.joints_m = f.depth_m * factor, f.joints_m * factor
-
-    return change
+    f.depth_m, f.joints_m = f.depth_m * factor, f.joints_m * factor
 
 
-def resolved(factor: float) -> Callable[[Frame], None]:
-    def change(f: Frame) -> None:
-        h, w = (int(side * factor) for side in f.depth_m.shape)
-        f.depth_m = cv2.resize(f.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
-        f.k = f.k.copy()
-        f.k[:2] *= factor
-
-    return change
+def resolved(f: Frame, factor: float) -> None:
+    h, w = (int(side * factor) for side in f.depth_m.shape)
+    f.depth_m = cv2.resize(f.depth_m, (w, h), interpolation=cv2.INTER_NEAREST)
+    f.k = f.k.copy()
+    f.k[:2] *= factor
 
 
-def grazing(degrees: float) -> Callable[[Frame], None]:
+def grazing(f: Frame, degrees: float) -> None:
     """Surfaces that are seen at more than this angle give no reading."""
-
-    def change(f: Frame) -> None:
-        points = cv2.GaussianBlur(f.ray_points().astype(np.float32), (0, 0), 0.8)
-        du, dv = np.gradient(points, axis=1), np.gradient(points, axis=0)
-        normal = np.cross(du, dv)
-        ray = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
-        cosine = np.abs((normal * ray).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-12)
-        f.depth_m = np.where(cosine < np.cos(np.radians(degrees)), 0, f.depth_m)
-
-    return change
+    points = cv2.GaussianBlur(f.ray_points().astype(np.float32), (0, 0), 0.8)
+    du, dv = np.gradient(points, axis=1), np.gradient(points, axis=0)
+    normal = np.cross(du, dv)
+    ray = points / np.maximum(np.linalg.norm(points, axis=-1, keepdims=True), 1e-9)
+    cosine = np.abs((normal * ray).sum(-1)) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-12)
+    f.depth_m = np.where(cosine < np.cos(np.radians(degrees)), 0, f.depth_m)
 
 
 def _arm_way(f: Frame) -> tuple[np.ndarray, np.ndarray]:
@@ -237,44 +185,32 @@ def without_arm(f: Frame) -> None:
     f.depth_m = np.where((along > 0.03) & (across < 0.09), 0, f.depth_m)
 
 
-def band(nearer_m: float) -> Callable[[Frame], None]:
+def band(f: Frame, nearer_m: float) -> None:
     """A watch or cuff on the wrist: nearer by so much, or without a reading (NaN)."""
-
-    def change(f: Frame) -> None:
-        along, across = _arm_way(f)
-        on = (along > 0.01) & (along < 0.05) & (across < 0.06) & (f.depth_m > 0)
-        f.depth_m = np.where(on, np.nan_to_num(f.depth_m - nearer_m), f.depth_m)
-
-    return change
+    along, across = _arm_way(f)
+    on = (along > 0.01) & (along < 0.05) & (across < 0.06) & (f.depth_m > 0)
+    f.depth_m = np.where(on, np.nan_to_num(f.depth_m - nearer_m), f.depth_m)
 
 
-def sleeve(thick_m: float) -> Callable[[Frame], None]:
+def sleeve(f: Frame, thick_m: float) -> None:
     """Cloth about the forearm from 2 cm beyond the wrist on, by fattening it."""
-
-    def change(f: Frame) -> None:
-        along, across = _arm_way(f)
-        arm = (along > 0.02) & (across < 0.07) & (f.depth_m > 0)
-        size = max(int(2 * thick_m * f.k[0, 0] / f.palm_m[2]) | 1, 3)
-        only = np.where(arm, f.depth_m - np.float32(0.6 * thick_m), 9).astype(np.float32)
-        cloth = cv2.erode(only, np.ones((size, size), np.uint8))
-        f.depth_m = np.where(
-            (cloth < 8) & (along > 0), np.minimum(_filled(f.depth_m), cloth), f.depth_m
-        )
-
-    return change
+    along, across = _arm_way(f)
+    arm = (along > 0.02) & (across < 0.07) & (f.depth_m > 0)
+    size = max(int(2 * thick_m * f.k[0, 0] / f.palm_m[2]) | 1, 3)
+    only = np.where(arm, f.depth_m - np.float32(0.6 * thick_m), 9).astype(np.float32)
+    cloth = cv2.erode(only, np.ones((size, size), np.uint8))
+    f.depth_m = np.where(
+        (cloth < 8) & (along > 0), np.minimum(_filled(f.depth_m), cloth), f.depth_m
+    )
 
 
-def behind(gap_m: float | None) -> Callable[[Frame], None]:
+def behind(f: Frame, gap_m: float | None) -> None:
     """A wall so far behind the hand's farthest joint; None = nothing is read there."""
-
-    def change(f: Frame) -> None:
-        if gap_m is None:
-            f.depth_m = np.where(f.depth_m > f.joints_m[:, 2].max() + 0.04, 0, f.depth_m)
-            return
-        wall = np.float32(f.joints_m[:, 2].max() + gap_m)
-        f.depth_m = np.minimum(_filled(f.depth_m), wall)
-
-    return change
+    if gap_m is None:
+        f.depth_m = np.where(f.depth_m > f.joints_m[:, 2].max() + 0.04, 0, f.depth_m)
+        return
+    wall = np.float32(f.joints_m[:, 2].max() + gap_m)
+    f.depth_m = np.minimum(_filled(f.depth_m), wall)
 
 
 def radial(f: Frame) -> None:
@@ -283,66 +219,63 @@ def radial(f: Frame) -> None:
     f.depth_m = np.where(f.depth_m > 0, np.linalg.norm(points, axis=-1), 0)
 
 
-def focal(factor: float) -> Callable[[Frame], None]:
+def focal(f: Frame, factor: float) -> None:
     """A focal length that is wrong by a factor; the truth moves along."""
-
-    def change(f: Frame) -> None:
-        f.k = f.k.copy()
-        f.k[0, 0] *= factor
-        f.k[1, 1] *= factor
-        f.joints_m = f.joints_m / np.array([factor, factor, 1])
-
-    return change
+    f.k = f.k.copy()
+    f.k[0, 0] *= factor
+    f.k[1, 1] *= factor
+    f.joints_m = f.joints_m / np.array([factor, factor, 1])
 
 
-PROPERTIES: dict[str, Callable[[Frame], None]] = {
-    "as it is": lambda f: None,
-    "noise of 3 mm": noise(0.003),
-    "noise of 6 mm": noise(0.006),
-    "noise of 12 mm": noise(0.012),
-    "waves of 4 mm, 3 px wide": waves(0.004, 3),
-    "waves of 8 mm, 6 px wide": waves(0.008, 6),
-    "steps of 5 mm": steps(0.005),
-    "steps of 10 mm": steps(0.010),
-    "steps of 20 mm": steps(0.020),
-    "1 in 10 readings missing": holes(0.1),
-    "3 in 10 readings missing": holes(0.3),
-    "1 in 10 patches of 3 px missing": holes(0.1, 3),
-    "edges of 1 px missing": edges_lost(3),
-    "edges of 2 px missing": edges_lost(5),
-    "edges 1 px fatter": fat(3),
-    "edges 2 px fatter": fat(5),
-    "shadows, base of 50 mm": shadows(0.05),
-    "flying pixels, 1 px": flying(3),
-    "flying pixels, 2 px": flying(5),
-    "smoothed, 5 px": smoothed(5),
-    "smoothed, 9 px": smoothed(9),
-    "median of 3 px": median(3),
-    "median of 5 px": median(5),
-    "holes of 2 px filled": closed(5),
-    "hollows 0.5 as deep": hollows(0.5),
-    "hollows 1.5 as deep": hollows(1.5),
-    "hollows 2 times as deep": hollows(2.0),
-    "relief 0.7 as deep": relief(0.7),
-    "relief 1.4 as deep": relief(1.4),
-    "hand 0.8 as large": sized(0.8),
-    "hand 0.9 as large": sized(0.9),
-    "hand 1.1 as large": sized(1.1),
-    "hand 1.2 as large": sized(1.2),
-    "half the resolution": resolved(0.5),
-    "twice the resolution": resolved(2.0),
-    "no reading beyond 60 degrees": grazing(60),
-    "no reading beyond 75 degrees": grazing(75),
-    "no forearm": without_arm,
-    "a watch, 8 mm high": band(0.008),
-    "a watch without readings": band(float("nan")),
-    "a sleeve of 12 mm": sleeve(0.012),
-    "a wall 3 cm behind": behind(0.03),
-    "nothing read behind": behind(None),
-    "distance taken for Z": radial,
-    "focal length 5 % too short": focal(0.95),
-    "focal length 10 % too long": focal(1.1),
+PROPERTIES: dict[str, tuple[Any, ...]] = {
+    "as it is": (lambda f: None,),
+    "noise of 3 mm": (noise, 0.003),
+    "noise of 6 mm": (noise, 0.006),
+    "noise of 12 mm": (noise, 0.012),
+    "waves of 4 mm, 3 px wide": (waves, 0.004, 3),
+    "waves of 8 mm, 6 px wide": (waves, 0.008, 6),
+    "steps of 5 mm": (steps, 0.005),
+    "steps of 10 mm": (steps, 0.010),
+    "steps of 20 mm": (steps, 0.020),
+    "1 in 10 readings missing": (holes, 0.1),
+    "3 in 10 readings missing": (holes, 0.3),
+    "1 in 10 patches of 3 px missing": (holes, 0.1, 3),
+    "edges of 1 px missing": (edges_lost, 3),
+    "edges of 2 px missing": (edges_lost, 5),
+    "edges 1 px fatter": (fat, 3),
+    "edges 2 px fatter": (fat, 5),
+    "shadows, base of 50 mm": (shadows, 0.05),
+    "flying pixels, 1 px": (flying, 3),
+    "flying pixels, 2 px": (flying, 5),
+    "smoothed, 5 px": (smoothed, 5),
+    "smoothed, 9 px": (smoothed, 9),
+    "median of 3 px": (median, 3),
+    "median of 5 px": (median, 5),
+    "holes of 2 px filled": (closed, 5),
+    "hollows 0.5 as deep": (hollows, 0.5),
+    "hollows 1.5 as deep": (hollows, 1.5),
+    "hollows 2 times as deep": (hollows, 2.0),
+    "relief 0.7 as deep": (relief, 0.7),
+    "relief 1.4 as deep": (relief, 1.4),
+    "hand 0.8 as large": (sized, 0.8),
+    "hand 0.9 as large": (sized, 0.9),
+    "hand 1.1 as large": (sized, 1.1),
+    "hand 1.2 as large": (sized, 1.2),
+    "half the resolution": (resolved, 0.5),
+    "twice the resolution": (resolved, 2.0),
+    "no reading beyond 60 degrees": (grazing, 60),
+    "no reading beyond 75 degrees": (grazing, 75),
+    "no forearm": (without_arm,),
+    "a watch, 8 mm high": (band, 0.008),
+    "a watch without readings": (band, float("nan")),
+    "a sleeve of 12 mm": (sleeve, 0.012),
+    "a wall 3 cm behind": (behind, 0.03),
+    "nothing read behind": (behind, None),
+    "distance taken for Z": (radial,),
+    "focal length 5 % too short": (focal, 0.95),
+    "focal length 10 % too long": (focal, 1.1),
 }
+"""Of each what changes a frame, and the numbers that it is given."""
 
 
 def keypoints(
@@ -360,9 +293,9 @@ def keypoints(
         seen = file["visible_fraction"] if "visible_fraction" in file else np.ones(len(depth))
     rows: dict[str, list] = {name: [] for name in PROPERTIES}
     for n in range(0, len(depth), every):
-        for name, change in PROPERTIES.items() if seen[n] > 0.7 else ():
+        for name, (change, *numbers) in PROPERTIES.items() if seen[n] > 0.7 else ():
             f = Frame(depth[n].astype(np.float32), k, joints[n], np.random.default_rng(n))
-            change(f)
+            change(f, *numbers)
             image = np.ascontiguousarray(f.depth_m, np.float32)
             up = f.joints_m[9] - f.joints_m[0]
             (first,) = detector.detect(image, f.k, f.palm_m[None], side, up[None])

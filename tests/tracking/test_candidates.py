@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import refinement
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
+from helpers.settings import refinement
 
 from toftrack.detector.crops import crop_rotation
 from toftrack.detector.hand_detector import Detection

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from helpers.configured import confidence_model
 from helpers.detection import detection_of
 from helpers.rendered import hand_at, track_of
+from helpers.settings import confidence_model
 from helpers.tracking import make_tracker, sample
 
 from toftrack.compute.pace import FRAME_S, Duration

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from helpers.configured import confidence_model
 from helpers.detection import detection_of
 from helpers.rendered import (
     hand_at,
@@ -18,6 +17,7 @@ from helpers.rendered import (
     track_of,
     view_of,
 )
+from helpers.settings import confidence_model
 
 from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.detector.proposals import SAME_PLACE_M

@@ -117,11 +117,3 @@ def test_the_other_hand_is_not_taken_for_one_that_has_left(apart: Scene) -> None
     ]
     assert not any(one.lost for one in found[3:8]) and max(off[3:8]) < 0.03
     assert all(one.lost for one in found[12:])
-
-
-def test_a_slot_more_than_there_are_hands_stays_empty(apart: Scene) -> None:
-    tracker = tracker_of("hands=3")
-    for i in range(10):
-        estimates = tracker.step(apart.depth_m[i], apart.k, i, i / 25)
-    assert [one.lost for one in estimates] == [False, False, True]
-    assert {one.side for one in estimates[:2]} == {"left", "right"}

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.configured import nearest_surface, rough_start
+from helpers.settings import nearest_surface, rough_start
 from helpers.tracking import Scene, configuration, errors_mm, follow, make_tracker, sample
 from omegaconf import OmegaConf
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import posterior_weights
 from helpers.detection import detection_of
 from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
+from helpers.settings import posterior_weights
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM

@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from helpers.configured import f_measure, nearest_surface
 from helpers.detection import detection_of
 from helpers.rendered import EMPTY, SIZE, WALL_M, K, hand_at, image_of, scene_of, track_of
+from helpers.settings import f_measure, nearest_surface
 
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape

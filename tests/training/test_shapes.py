@@ -65,12 +65,6 @@ def test_flesh_lies_about_the_bones_of_its_own_hand() -> None:
         assert float(grown.log().std()) > math.log(1.02)
 
 
-def test_a_seed_gives_the_same_hands() -> None:
-    one, two = (shape_bank(3, torch.Generator().manual_seed(7)) for _ in range(2))
-    assert torch.equal(one.shape.base_m, two.shape.base_m)
-    assert torch.equal(one.surface.axes_m, two.surface.axes_m)
-
-
 def _hollow(curled: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Of hands whose fingers are bent by a share of a fist's: by how much cupping moves the joints
     (N, 21, 3), and how far thenar and hypothenar stand out before the palm's middle (N, 2), m.

@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from helpers.configured import f_measure
 from helpers.moments import tracked, two_hands, with_hand
+from helpers.settings import f_measure
 from helpers.tracking import configuration, make_tracker
 from hydra.utils import instantiate
 

@@ -74,8 +74,8 @@ def _limits(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
     return table(ANGLE_LIMITS, dtype, device).T.contiguous().unbind(0)
 
 
-def clamped_share(space: PoseSpace, latent: Tensor, slack_rad: float = 1e-3) -> float:
+def clamped_share(space: PoseSpace, latent: Tensor) -> float:
     """Part of the decoded angles, 0 .. 1, that the joint limits had to move; latent (N, d)."""
     free = space.decode_freely(latent)
-    moved = (clamp_to_joint_limits(free) - free).abs() > slack_rad
+    moved = (clamp_to_joint_limits(free) - free).abs() > 1e-3
     return float(moved.float().mean())

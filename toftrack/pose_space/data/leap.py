@@ -89,10 +89,10 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
     return PoseData(angles[rows], labels, owner[rows], (source | fit,), notes)
 
 
-def clip_families(clips: list[Tensor], share: float = 0.5) -> list[int]:
+def clip_families(clips: list[Tensor]) -> list[int]:
     """Which clips repeat one another: a family number a clip.
 
-    clips: each (T, 5, 4, 3) metres. Two belong together when at least `share` of the frames of the
+    clips: each (T, 5, 4, 3) metres. Two belong together when at least half of the frames of the
     shorter are within _SAME_MM of a frame of the other, moved to a common middle.
     """
     flat = [(c - c.mean((1, 2), keepdim=True)).flatten(1).float() for c in clips]
@@ -102,7 +102,7 @@ def clip_families(clips: list[Tensor], share: float = 0.5) -> list[int]:
         for j in range(i):
             short, long = sorted((flat[i], flat[j]), key=len)
             same = torch.cdist(short, long).amin(1) < limit
-            if float(same.float().mean()) >= share:
+            if float(same.float().mean()) >= 0.5:
                 old, new = family[i], family[j]
                 family = [new if f == old else f for f in family]
     return family
