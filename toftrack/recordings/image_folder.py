@@ -86,7 +86,7 @@ class ZippedFiles(Files):
         self.path, self.what = path, f"the archive '{path}'"
         self._zip: zipfile.ZipFile | None = None
         with self.reported():
-            entries = [entry for entry in self._opened().infolist() if not entry.is_dir()]
+            entries = [one for one in self._opened().infolist() if not one.filename.endswith("/")]
             self.names = [entry.filename for entry in entries]
             for entry in entries:
                 parts = entry.filename.replace("\\", "/").split("/")
