@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from toftrack.errors import ToftrackError
-from toftrack.evaluation import alternating, speed
+from toftrack.evaluation import accuracy, alternating, speed
 from toftrack.evaluation.alternating import FIRST, PEER_HANDS, Program, Times, runner, show, timed
 from toftrack.programs import benchmark
 
@@ -109,3 +110,27 @@ def test_what_cannot_be_timed_is_reported(words, monkeypatch) -> None:
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     with pytest.raises((ToftrackError, SystemExit)):
         benchmark.main(["speed", *words])
+
+
+@pytest.mark.parametrize("place", ["link", "pipe", "folder", "gone/file", "read_only"])
+@pytest.mark.parametrize("command", ["speed", "alternating", "accuracy"])
+def test_what_cannot_be_written_is_said_before_anything_is_measured(
+    command, place, tmp_path, monkeypatch
+) -> None:
+    def measured(*_: object) -> None:
+        raise AssertionError
+
+    for module, name in ((speed, "run"), (alternating, "measure"), (accuracy, "run_jobs")):
+        monkeypatch.setattr(module, name, measured)
+    monkeypatch.chdir(tmp_path)
+    Path("mine").write_text("mine")
+    Path("link").symlink_to("mine")
+    os.mkfifo("pipe")
+    Path("folder").mkdir()
+    Path("read_only").write_text("mine")
+    if place == "read_only":  # which nothing is for the superuser
+        monkeypatch.setattr("os.access", lambda path, mode: str(path) != place)
+    given = [str(Path(alternating.__file__).parents[1] / "data")] * (command == "accuracy")
+    with pytest.raises(ToftrackError, match=f"'{place}' cannot be written .*; give another name"):
+        benchmark.main([command, *given, "--json", place])
+    assert Path("mine").read_text() == "mine"

@@ -99,6 +99,38 @@ def test_convert_errors(srs: Path, tmp_path: Path) -> None:
             convert.convert(*arguments)
 
 
+@pytest.mark.parametrize("name", ["there.npz", "there.srs"])
+def test_what_is_there_stays_until_the_new_recording_is_whole(
+    name: str, srs: Path, tmp_path: Path
+) -> None:
+    convert.convert(srs, tmp_path / "images")
+    (tmp_path / "images" / "depth_000007.png").write_bytes(b"damaged")
+    there = tmp_path / name
+    there.write_text("mine")
+    with pytest.raises(ToftrackError, match="depth_000007.png"):
+        convert.convert(tmp_path / "images", there, overwrite=True)
+    assert there.read_text() == "mine"
+    assert {file.name for file in tmp_path.iterdir()} == {"images", name}
+    convert.convert(srs, there, overwrite=True)
+    assert there.stat().st_size > 1000
+
+
+@pytest.mark.parametrize("mine", ["camera.json", "timestamps.txt", "1.tif", "depth_1.PNG"])
+def test_a_folder_that_holds_images_or_their_facts_is_left_as_it_is(
+    mine: str, srs: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("these may be there")
+    (folder / mine).write_text("mine")
+    with pytest.raises(ToftrackError, match="already; choose an empty one"):
+        convert.convert(srs, folder, overwrite=True)
+    assert {file.name for file in folder.iterdir()} == {mine, "notes.txt"}
+    assert (folder / mine).read_text() == "mine"
+    (folder / mine).unlink()
+    assert convert.convert(srs, folder) == 12
+
+
 @pytest.mark.parametrize("name", ["a.mkv", "a.npy", "pictures"])
 def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path, name: str) -> None:
     words = np.random.default_rng(0).integers(1, 5000, (3, 24, 32)).astype(np.uint16)
@@ -212,7 +244,7 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     np.testing.assert_array_equal(folder.image(1)[1], amplitude)
     np.testing.assert_array_equal(folder.timestamp_s, [0, 1 / 7])
     assert (folder.radial, folder.fps, folder.metadata) == (True, 30, {"a": 1})
-    with pytest.raises(ToftrackError, match="contains PNG"):
+    with pytest.raises(ToftrackError, match="has images, camera.json or"):
         PngFolderWriter(tmp_path / "f", camera)
 
 

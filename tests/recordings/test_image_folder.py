@@ -311,3 +311,13 @@ def test_an_archive_is_converted_with_its_camera_and_times(tmp_path: Path) -> No
     with make_device("device=replay", f"device.path={tmp_path / 'out.npz'}") as device:
         assert [frame.timestamp_s for frame in device] == [1, 1.5, 2]
         assert device.camera.K[0, 0] == 40
+
+
+def test_a_file_without_a_name_in_a_zip_is_one_sentence(tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / "images.zip", "w") as archive:
+        archive.writestr("x", b"")
+    content = (tmp_path / "images.zip").read_bytes()
+    # A name that begins with a zero ends there.
+    (tmp_path / "images.zip").write_bytes(content.replace(b"x", b"\0"))
+    with pytest.raises(ToftrackError, match="leads out of it"):
+        read_image_folder(tmp_path / "images.zip")

@@ -208,6 +208,17 @@ def test_existing_files_are_not_overwritten_unless_asked(path: Path) -> None:
         SrsWriter(path.parent / "nowhere" / "a.srs")
 
 
+def test_a_recording_that_grows_is_not_taken_away_by_another(path: Path) -> None:
+    pytest.importorskip("fcntl")
+    with SrsWriter(path) as writer:
+        writer.append(raw_frames(1)[0], 0.0)
+        with pytest.raises(ToftrackError, match="being recorded just now"):
+            SrsWriter(path, overwrite=True)
+        writer.append(raw_frames(1)[0], 0.04)
+    assert len(read_srs(path)) == 2
+    SrsWriter(path, overwrite=True).close()
+
+
 def test_a_full_disk_is_reported_and_the_whole_frames_are_kept(path: Path) -> None:
     # In a process of its own, whose files may not become larger than two frames and a half.
     program = f"""

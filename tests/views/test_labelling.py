@@ -204,13 +204,15 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         (["gone.npz"], "no file 'gone.npz'"),
         (["OWN", "--frames", "0"], "--frames=0"),
         (["OWN", "--port", "70000"], "--port=70000"),
-        (["OWN", "--output", "gone/labels.json"], "lies in none that there is"),
+        (["OWN", "--output", "gone/labels.json"], "lies in no folder that is"),
+        (["OWN", "--output", "link.json"], "it is a symbolic link"),
         (["OWN", "device.repeat=true"], "leave out device.repeat"),
         (["OWN", "device.start=1"], "leave out device.start"),
     ],
 )
 def test_what_cannot_be_labelled_is_one_sentence(words, reported, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("link.json").symlink_to("elsewhere.json")
     own = str(without_truth(tmp_path, 3)[0])
     given = [own if word == "OWN" else word for word in words]
     with pytest.raises(ToftrackError, match=re.escape(reported)):

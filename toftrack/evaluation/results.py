@@ -22,12 +22,12 @@ import numpy as np
 import torch
 
 import toftrack
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import reported_errors
 from toftrack.evaluation.figures import COMPARED, Columns, columns
 from toftrack.evaluation.rows import Row, by_recording, groups, image_totals, interval_name, totals
 from toftrack.evaluation.statistics import interval, text_of
 from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.files.safe_files import check_replaceable, write_whole
 
 FORMAT = "toftrack accuracy 1"
 Table = list[list[str]]
@@ -127,12 +127,13 @@ def _check_row(row: Any) -> None:
 
 def checked_targets(*paths: Path | None) -> None:
     """Whether files can be written there; before the work, not after it."""
-    for path in paths:
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise ToftrackError(
-                f"'{path}' cannot be written: it is a folder, or lies in none that there is; give "
-                "another name"
-            )
+    for path in filter(None, paths):
+        with reported_errors(f"'{path}' cannot be written", "give another name"):
+            check_replaceable(path)
+            if not os.access(path.absolute().parent, os.W_OK):
+                raise OSError("it lies in no folder that is there and may be written")
+            if path.exists() and not os.access(path, os.W_OK):
+                raise OSError("it may only be read")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -13,7 +13,6 @@ from typing import Any
 
 from toftrack.configuration.compose import searched
 from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
-from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import plain_parser
 
 
@@ -39,7 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _speed(arguments: Sequence[str]) -> None:
-    from toftrack.evaluation import speed
+    from toftrack.evaluation import results, speed
 
     parser = plain_parser("toftrack benchmark", speed.__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
@@ -53,14 +52,15 @@ def _speed(arguments: Sequence[str]) -> None:
     given = parser.parse_args(arguments)
     if min(given.particles) < 1:
         parser.error("--particles must be above 0")
+    results.checked_targets(given.json)
     baselines = not given.no_baselines
     result = speed.run(given.particles, given.compute, given.seconds, given.frames, baselines)
     if given.json:
-        write_whole(given.json, json.dumps(result, indent=1) + "\n")
+        results.write_text(given.json, json.dumps(result, indent=1) + "\n")
 
 
 def _alternating(arguments: Sequence[str]) -> None:
-    from toftrack.evaluation import alternating
+    from toftrack.evaluation import alternating, results
 
     parser = plain_parser("toftrack benchmark alternating", alternating.__doc__)
     parser.add_argument("--rounds", type=int, default=5, help="of all programs (5); 0 = none")
@@ -72,11 +72,12 @@ def _alternating(arguments: Sequence[str]) -> None:
     given = parser.parse_args(arguments)
     if min(given.rounds, given.starts) < 0 or (given.cores or 1) < 1:
         parser.error("--rounds and --starts must be 0 or more, --cores 1 or more")
+    results.checked_targets(given.json)
     result = alternating.measure(
         given.rounds, given.starts, given.cores, given.two_hands, given.peer_python
     )
     if given.json:
-        write_whole(given.json, json.dumps(result) + "\n")
+        results.write_text(given.json, json.dumps(result) + "\n")
 
 
 def _accuracy(arguments: Sequence[str]) -> None:

@@ -9,6 +9,7 @@ lens: give `--intrinsics FX FY CX CY` (pixels) or `--camera FILE`.
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -17,7 +18,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.safe_files import whole_file
 from toftrack.frames.camera import Camera
 from toftrack.programs.command_line import Parser
 from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
@@ -31,7 +33,7 @@ from toftrack.recordings.sr_frame import (
     to_radial,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs import SrsFacts, SrsRecording, SrsWriter
+from toftrack.recordings.srs import SrsFacts, SrsInit, SrsRecording, srs_frame, srs_head
 from toftrack.recordings.store import open_recording
 
 _MILLIMETRE = 0.001
@@ -89,7 +91,7 @@ def convert(
         raise ToftrackError(
             f"'{target}' is neither .srs nor .npz, nor a folder's name; give one of them"
         )
-    if kind == ".npz" and target.exists() and not overwrite:
+    if kind in (".srs", ".npz") and os.path.lexists(target) and not overwrite:
         raise ToftrackError(
             f"the file '{target}' exists already; choose another name or give --overwrite"
         )
@@ -112,18 +114,20 @@ def convert(
             if kind == ".npz":
                 write_recording(target, store, bar.update)
             elif kind == ".srs":
-                _to_srs(store, target, unambiguous_range_m(modulation_mhz), overwrite, bar)
+                _to_srs(store, target, unambiguous_range_m(modulation_mhz), bar)
             else:
                 _to_folder(store, target, unit_m, bar)
         return len(store)
 
 
-def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, bar: tqdm) -> None:
-    init, registers = None, bytes(REGISTERS)
+def _to_srs(store: FrameStore, target: Path, range_m: float, bar: tqdm) -> None:
+    init, registers = SrsInit(), bytes(REGISTERS)
     if isinstance(store, SrsRecording):
         init, registers, range_m = store.init, store.registers or registers, store.range_m
     facts = SrsFacts(range_m, store.camera, store.fps, store.metadata)
-    with SrsWriter(target, init, registers, facts, overwrite) as writer:
+    what = f"the recording '{target}' cannot be written"
+    with reported_errors(what, "choose another place"), whole_file(target) as stream:
+        stream.write(srs_head(init, registers, facts))
         for index, time_s in enumerate(store.timestamp_s):
             if isinstance(store, SrsRecording):
                 data = store.raw(index)
@@ -131,7 +135,7 @@ def _to_srs(store: FrameStore, target: Path, range_m: float, overwrite: bool, ba
                 depth, amplitude = store.image(index)
                 radial = to_radial(depth, store.radial, store.camera)
                 data = encode_frame(radial, amplitude, range_m)
-            writer.append(data, float(time_s))
+            stream.write(srs_frame(data, float(time_s)))
             bar.update()
 
 

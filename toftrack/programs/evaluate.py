@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from pathlib import Path
 
 from toftrack.configuration.compose import searched
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError
 from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_set
 from toftrack.evaluation.public import evaluate, table, totals
-from toftrack.files.safe_files import write_whole
+from toftrack.evaluation.results import checked_targets, write_text
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.programs.command_line import Parser
 
@@ -28,10 +29,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--frames", type=_count, help="only so many at the start of each sequence")
     about = "how far the labels' fingertips lie inside of ours, instead of the data set's own"
     add("--tip-inset", type=float, metavar="MM", help=about)
-    add("--json", metavar="FILE", help="write the figures here, too")
+    add("--json", type=Path, metavar="FILE", help="write the figures here, too")
     options = parser.parse_intermixed_args(arguments)
     if options.config_dir is not None:
         options.overrides.insert(0, searched(options.config_dir))
+    checked_targets(options.json)
     data_set, sequences = open_data_set(options.data_set, options.folder)
     sequences = _chosen(sequences, options.sequences)
     inset_m = data_set.tip_inset_m if options.tip_inset is None else options.tip_inset / 1e3
@@ -47,8 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "total": totals(figures),
             "sequences": figures,
         }
-        with reported_errors(f"'{options.json}' cannot be written", "choose another place"):
-            write_whole(options.json, json.dumps(facts, indent=1, allow_nan=False) + "\n")
+        write_text(options.json, json.dumps(facts, indent=1, allow_nan=False) + "\n")
     print(table(figures))
     print(f"compared: {', '.join(JOINT_NAMES[row] for row in data_set.joints)}")
     print(f"tips: {data_set.tips}; ours are moved {1e3 * inset_m:g} mm inwards")

@@ -86,7 +86,7 @@ class ZippedFiles(Files):
         self.path, self.what = path, f"the archive '{path}'"
         self._zip: zipfile.ZipFile | None = None
         with self.reported():
-            entries = [entry for entry in self._opened().infolist() if not entry.is_dir()]
+            entries = [one for one in self._opened().infolist() if not one.filename.endswith("/")]
             self.names = [entry.filename for entry in entries]
             for entry in entries:
                 parts = entry.filename.replace("\\", "/").split("/")
@@ -307,8 +307,8 @@ def _beside(files: Files, image: str, name: str) -> str | None:
 class PngFolderWriter:
     """Writes a folder that `read_image_folder` reads; use it with `with`.
 
-    folder: made when it does not exist; must not contain PNG images.  unit_m: metres of one step of
-    the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
+    folder: made when it does not exist; must hold nothing of such a folder.  unit_m: metres of one
+    step of the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
     ToftrackError: the folder cannot be written or is in use.
     """
 
@@ -325,15 +325,15 @@ class PngFolderWriter:
         facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
         with self._writing():
             self.folder.mkdir(parents=True, exist_ok=True)
-            if any(self.folder.glob("*.png")):
+            names = (_CAMERA, _TIMES)
+            if any(at.suffix.lower() in _DEPTH or at.name in names for at in self.folder.iterdir()):
                 raise ToftrackError(
-                    f"the folder '{self.folder}' contains PNG images already; choose an empty one"
+                    f"the folder '{self.folder}' has images, {_CAMERA} or {_TIMES} already; choose "
+                    "an empty one"
                 )
             text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
             write_whole(self.folder / _CAMERA, text)
-            self._times = io.TextIOWrapper(
-                open_new(self.folder / _TIMES, replace=True), encoding="utf-8"
-            )
+            self._times = io.TextIOWrapper(open_new(self.folder / _TIMES), encoding="utf-8")
 
     def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
         """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and

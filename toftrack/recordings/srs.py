@@ -92,6 +92,28 @@ def _parse_facts(path: Path, text: bytes) -> SrsFacts:
     return SrsFacts(range_m, camera, fps, metadata)
 
 
+def srs_head(init: SrsInit, registers: bytes, facts: SrsFacts) -> bytes:
+    """What stands in a file before its frames."""
+    numbers = (init.product_id, init.interface_type, init.serial_number)
+    about = {
+        "range_m": facts.range_m,
+        "fps": facts.fps,
+        "camera": facts.camera and facts.camera.to_dict(),
+        "metadata": facts.metadata,
+    }
+    return (
+        _PAIR.pack(_SIGNATURE, _VERSION)
+        + _object(_INIT, _THREE.pack(*(n & 0xFFFFFFFF for n in numbers)))
+        + _object(_FACTS, json.dumps(about).encode())
+        + _object(_CONFIGURE, registers)
+    )
+
+
+def srs_frame(data: bytes, timestamp_s: float) -> bytes:
+    """A raw frame as it stands in a file."""
+    return _object(_STAMP, _SECONDS.pack(timestamp_s)) + _object(_FRAME, data)
+
+
 class SrsWriter:
     """Appends frames to a new `.srs` file; use it with `with`.
 
@@ -113,14 +135,6 @@ class SrsWriter:
         self.path = Path(path).expanduser()
         self.frames = 0
         """Whole frames written."""
-        init, facts = init or SrsInit(), facts or SrsFacts()
-        numbers = (init.product_id, init.interface_type, init.serial_number)
-        about = {
-            "range_m": facts.range_m,
-            "fps": facts.fps,
-            "camera": facts.camera and facts.camera.to_dict(),
-            "metadata": facts.metadata,
-        }
         if not overwrite and os.path.lexists(self.path):
             raise ToftrackError(
                 f"the file '{self.path}' exists already; choose another name or give --overwrite"
@@ -129,12 +143,7 @@ class SrsWriter:
         with reported_errors(what, "choose another place"):
             self._file = GrowingFile(self.path, overwrite)
         try:
-            self._write(
-                _PAIR.pack(_SIGNATURE, _VERSION)
-                + _object(_INIT, _THREE.pack(*(n & 0xFFFFFFFF for n in numbers)))
-                + _object(_FACTS, json.dumps(about).encode())
-                + _object(_CONFIGURE, registers)
-            )
+            self._write(srs_head(init or SrsInit(), registers, facts or SrsFacts()))
         except BaseException:
             self.close()
             raise
@@ -149,7 +158,7 @@ class SrsWriter:
         """
         if len(data) != FRAME_BYTES:
             raise ToftrackError(f"a frame has {FRAME_BYTES} bytes, but {len(data)} came")
-        self._write(_object(_STAMP, _SECONDS.pack(timestamp_s)) + _object(_FRAME, data))
+        self._write(srs_frame(data, timestamp_s))
         self.frames += 1
 
     def close(self) -> None:

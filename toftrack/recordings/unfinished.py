@@ -81,14 +81,19 @@ class _Kept:
 
 class GrowingFile:
     """A new file that grows by whole records; each is the operating system's when `write` returns.
-    Raises OSError: something stands there, or it cannot be made.
+
+    replace: let a file that stands there go. Raises ToftrackError where another process writes the
+    file, and OSError where something stands there, or it cannot be made.
     """
 
     def __init__(self, path: Path, replace: bool) -> None:
+        if replace and path.exists():
+            _locked(path).close()
         self.bytes = 0
         """What its whole records take."""
         # Without a buffer of Python's: what is written outlives the process.
         self.stream = open_new(path, replace, buffered=False)
+        _lock(self.stream, path)
 
     def write(self, *parts: bytes) -> None:
         """Write a record. Raises OSError; the file then ends with the record before."""
@@ -109,18 +114,14 @@ class GrowingFile:
 
 
 class UnfinishedRecording(GrowingFile):
-    """A file that grows by frames; replace: let a file that stands there go. Raises ToftrackError
-    where another process writes the file, and OSError where it exists, or cannot be made or
+    """A file that grows by frames. Raises as a `GrowingFile`, and OSError where it cannot be
     written; then it ends with the frame before.
     """
 
     def __init__(self, path: Path, replace: bool = False) -> None:
-        if replace and path.exists():
-            _locked(path).close()
         self.path, self.frames = path, 0
         self._sums = [0, 0]
         super().__init__(path, replace)
-        _lock(self.stream, path)
 
     def begin(self, facts: Facts) -> None:
         """Write what holds for all frames."""
