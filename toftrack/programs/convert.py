@@ -91,12 +91,12 @@ def convert(
         raise ToftrackError(
             f"'{target}' is neither .srs nor .npz, nor a folder's name; give one of them"
         )
+    if target.exists() and Path(source).expanduser().resolve() == target.resolve():
+        raise ToftrackError(f"'{target}' cannot be converted into itself; choose another name")
     if kind in (".srs", ".npz") and os.path.lexists(target) and not overwrite:
         raise ToftrackError(
             f"the file '{target}' exists already; choose another name or give --overwrite"
         )
-    if target.exists() and Path(source).expanduser().resolve() == target.resolve():
-        raise ToftrackError(f"'{target}' cannot be converted into itself; choose another name")
     if camera_file is not None and bare.intrinsics is not None:
         raise ToftrackError("--camera and --intrinsics both tell the lens; leave one out")
     opened = open_recording(source, camera_file, modulation_mhz, topic, bare)
