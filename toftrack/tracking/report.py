@@ -44,8 +44,8 @@ _OTHER = 0.4
 """A hand that is less probably of the side that the user said is flagged as another one."""
 _STAYS, _CONFIRMED, _MOST = 2.0, 6.0, 3.0
 """Worth of a track to a slot, log odds: for being there before, for being confirmed, and, at most,
-for its log odds and for its side. With 4 for being there, an elbow kept the only slot to the end
-after something had hidden the hand (1 of 35 fresh recordings; silently wrong 39 %, now 13)."""
+for its log odds and for its side. With 4 for being there, an elbow kept the only slot after
+something had hidden the hand."""
 _GONE_S = 2.0
 """Where no side was said, one of the other side takes the place of a hand away for so long."""
 
