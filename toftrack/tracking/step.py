@@ -14,7 +14,7 @@ from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import associate, keep_tracks
-from toftrack.tracking.candidates import View, propose, select
+from toftrack.tracking.candidates import View, propose, select, with_parts
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
@@ -43,11 +43,12 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     optimisation of few hypotheses (Gall et al., IJCV 87, 2010):
 
     1. Predict each track's hand, and which track owns which pixels.
-    2. Detect: the pose network, which votes for joints (A2J: Xiong et al., ICCV 2019), looks at
+    2. Filter: resample, diffuse and weigh all tracks' particles (B, N, 6 + d) by the F-measure of
+       the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005). Meanwhile
+    3. detect: the pose network, which votes for joints (A2J: Xiong et al., ICCV 2019), looks at
        predicted hands, and where the finder, which sees the whole image, finds a hand of no track.
-    3. Associate detections with tracks; the unassigned ones begin tentative tracks.
-    4. Filter: resample, diffuse and weigh all tracks' particles (B, N, 6 + d) by the F-measure of
-       the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005).
+    4. Associate detections with tracks; the unassigned ones begin tentative tracks, whose particles
+       are filtered now, as are those of tracks that a detection moves.
     5. Refine a few hypotheses (M, 27) by Gauss-Newton steps; the best posterior is the pose.
     6. Judge it, learn the hand's shape, end tracks that stay doubtful or share another one's hand.
     7. Report the tracks in the slots that the user asked for.
@@ -61,6 +62,11 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         predicted = [
             None if rests(scene, row, state) else predicted_view(scene, row) for row in rows
         ]
+    with spans("filter: rest"):
+        seed = int(torch.randint(2**62, (1,), generator=generator))
+        expected = [as_last_seen(view) for view in predicted if view is not None]
+        filtered = filter_tracks(expected, state, dt_s, model, seed, spans)
+    with spans("detector"):
         detections = finish_detection(pending, scene, state)
         found, new = associate(scene.hands, detections, dt_s)
         continued = [
@@ -70,8 +76,9 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         begun = [begin_track(scene, one, number, state) for number, one in numbered]
         views = [view for view in continued + begun if view is not None]
     with spans("filter: rest"):
-        particles = filter_tracks(views, state, dt_s, model, generator, spans)
-    results = [update_track(*each, scene, spans) for each in zip(views, particles, strict=True)]
+        moved = [view for view in views if view.track.cloud not in filtered]
+        filtered |= filter_tracks(moved, state, dt_s, model, seed, spans)
+    results = [update_track(view, filtered[view.track.cloud], scene, spans) for view in views]
     resting = [
         rest_track(scene, row)
         for row in rows
@@ -104,28 +111,35 @@ def rest_track(scene: Scene, row: int) -> Track:
     )
 
 
+def as_last_seen(view: View) -> View:
+    """A predicted view with its pixels told apart by the network's last look at the track's hand:
+    things in a hand, and its arm, hardly move in it from frame to frame.
+    """
+    return with_parts(changed(view, detection=view.track.looked))
+
+
 def filter_tracks(
     views: Sequence[View],
     state: TrackerState,
     dt_s: float,
     model: TrackerModel,
-    generator: torch.Generator,
+    seed: int,
     spans: Spans,
-) -> list[ParticleSet]:
-    """The particles of tracks: filtered if a slot shows them or they are doubtful, else moved on.
+) -> dict[ParticleSet, ParticleSet]:
+    """What becomes of the particles of tracks: filtered if a slot shows them or they are doubtful,
+    else moved on.
 
     What is drawn for a track depends on its number, not on which others there are.
     """
-    seed = int(torch.randint(2**62, (1,), generator=generator))
     chosen = [state.shows(view.track) or not view.track.reliable for view in views]
     filtered = list(compress(views, chosen))
     tracks, images = [view.track for view in filtered], [view.image for view in filtered]
     generators = [torch.Generator().manual_seed(seed + track.number) for track in tracks]
     found = iter(run_filter(tracks, dt_s, images, model, generators, spans))
-    return [
-        next(found) if one else predict_particles(view.track, dt_s, model)
+    return {
+        view.track.cloud: next(found) if one else predict_particles(view.track, dt_s, model)
         for view, one in zip(views, chosen, strict=True)
-    ]
+    }
 
 
 def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) -> TrackResult:
@@ -167,6 +181,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         confirmed=track.confirmed or believed,
         believed_s=0.0 if believed else track.believed_s + dt_s,
         asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
+        looked=track.looked if view.detection.empty else view.detection,
         features=features,
         nearest_m=view.expected_m if view.hidden else 0.0,
     )
