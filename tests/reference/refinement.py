@@ -182,7 +182,7 @@ def silhouette_residuals(
 ) -> Residuals:
     """Of points on the bones' axes: how far they stick out of the silhouette, in u and in v."""
     frames, origins = pose.frames[:, 1:], pose.origins_m[:, 1:]
-    (top, left), (high, wide) = seen.corner, seen.nearest_px.shape[:2]
+    (top, left), (high, wide) = seen.corner, seen.beside.shape
     if high == 0:
         return Residuals(frames.new_zeros(len(frames), 0, 27), frames.new_zeros(len(frames), 0))
     parts = table(ALONG_BONE, origins.dtype, origins.device)
@@ -195,7 +195,7 @@ def silhouette_residuals(
     inside = (u > 0) & (u < width - 1) & (v > 0) & (v < height - 1)
     column = (u.nan_to_num().round().long() - left).clamp(0, wide - 1)
     row = (v.nan_to_num().round().long() - top).clamp(0, high - 1)
-    gap = torch.stack((u, v), -1) - seen.nearest_px[row, column]
+    gap = torch.stack((u, v), -1) - nearest_px(seen, row, column)
     outside = gap.norm(dim=-1)
     weight = (inside & (outside > 1.0)) / (1 + (outside / SILHOUETTE_PX).square())
     weight = weight.repeat(1, 2) / settings.silhouette_px
@@ -205,6 +205,18 @@ def silhouette_residuals(
     by = torch.cat((by_u, by_v), 1)
     rows = point_jacobian(pose, shape, x.repeat(1, 2, 1), by, frame.repeat(2))
     return Residuals(rows * weight[..., None], gap.mT.flatten(1) * weight)
+
+
+def nearest_px(seen: SeenPoints, row: Tensor, column: Tensor) -> Tensor:
+    """(..., 2) column and row, in the image, of the pixels that are not background and nearest to
+    pixels of the crop (...,); of several the one in the nearer row, above, to the left.
+    """
+    columns = torch.arange(seen.beside.shape[1])
+    solid = (seen.beside == columns).nonzero()
+    down, right = (solid - torch.stack((row, column), -1).reshape(-1, 1, 2)).unbind(-1)
+    away = down**2 + right**2 + 1e-4 * down.abs() + 1e-6 * (down > 0) + 1e-8 * (right > 0).double()
+    found = solid[away.argmin(1)] + torch.tensor(seen.corner)
+    return found.flip(1).to(seen.k.dtype).reshape(*row.shape, 2)
 
 
 def keypoint_residuals(pose: HandPose, keypoints: Keypoints, shape: HandShape) -> Residuals:

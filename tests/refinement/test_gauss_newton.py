@@ -90,7 +90,7 @@ def seen_hand(shape: HandShape, seed: int, n: int = 1) -> tuple[Tensor, SeenPoin
 
 def nothing_in(seen: SeenPoints) -> SeenPoints:
     """No point of a hand, and no background that a finger could stick out over."""
-    return replace(seen, points_m=torch.zeros(0, 3), nearest_px=torch.zeros(0, 0, 2))
+    return replace(seen, points_m=torch.zeros(0, 3), beside=torch.zeros(0, 0, dtype=torch.int32))
 
 
 def check_agreement(

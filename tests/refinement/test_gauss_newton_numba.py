@@ -25,7 +25,7 @@ from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement import gauss_newton_numba as compiled
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.gauss_newton_numba import Refiner
-from toftrack.refinement.seen_points import SeenPoints
+from toftrack.refinement.seen_points import SeenPoints, smooth_points
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -144,12 +144,13 @@ def test_seen_points_add_up_as_in_the_reference(side: str, z: float) -> None:
 
 
 def silhouette(seed: int, height: int, width: int) -> SeenPoints:
-    """For each pixel some other pixel: what is nearest does not matter here."""
-    g = torch.Generator().manual_seed(seed)
+    """Few pixels that are not background, anywhere: one is the nearest to most places."""
+    solid = np.random.default_rng(seed).random((height, width)) < 0.002
+    nothing = np.zeros((height, width), np.float32)
+    points, beside = smooth_points(nothing, solid, solid, (0, 0), np.eye(3, dtype=np.float32))
     size = height, width
-    each = [torch.randint(most, size, generator=g) for most in (width, height)]
-    nearest = torch.stack(each, -1).float()
-    return SeenPoints(torch.zeros(0, 3), nearest, torch.from_numpy(K), size, (0, 0))
+    seen = torch.from_numpy(points[:0].copy()), torch.from_numpy(beside)
+    return SeenPoints(*seen, torch.from_numpy(K), size, (0, 0))
 
 
 @pytest.mark.parametrize("side", SIDES)
@@ -157,8 +158,10 @@ def silhouette(seed: int, height: int, width: int) -> SeenPoints:
 def test_the_silhouette_adds_up_as_in_the_reference(side: str, z: float, cut: int) -> None:
     """cut: rows and columns that the crop lacks on either side."""
     posed, seen = posed_hand(side, 8, z), silhouette(9, 144, 176)
-    inner = seen.nearest_px[cut : 144 - cut, cut : 176 - cut].contiguous()
-    seen = replace(seen, nearest_px=inner, corner=(cut, cut))
+    solid = (seen.beside == torch.arange(176))[cut : 144 - cut, cut : 176 - cut].numpy()
+    nothing, k = np.zeros(solid.shape, np.float32), np.eye(3, dtype=np.float32)
+    inner = torch.from_numpy(smooth_points(nothing, solid, solid, (0, 0), k)[1])
+    seen = replace(seen, beside=inner, corner=(cut, cut))
     arguments = (seen.points_m.numpy(), inner.numpy(), seen.corner, seen.size, K)
     wrenches = no_wrenches()
     _add_silhouette(arguments, posed.refiner._shape[2], posed.hand, 1.5, wrenches)

@@ -35,7 +35,7 @@ from toftrack.refinement.gauss_newton import (
     Keypoints,
     Refinement,
 )
-from toftrack.refinement.seen_points import REACH_M, SeenPoints
+from toftrack.refinement.seen_points import REACH_M, SeenPoints, nearest_solid
 
 _JOINT_FRAME = np.array(JOINT_FRAME)
 _REACH = np.float32(REACH_M**2)
@@ -198,9 +198,9 @@ def add_points(matched, count, index, posed, hand, settings, wrenches):
 @compiled
 def add_silhouette(seen, lengths, hand, deviation, wrenches):
     """The silhouette's part of the normal equations, see silhouette_residuals."""
-    _, nearest_px, corner, size, k = seen
+    _, beside, corner, size, k = seen
     frames, joints, _ = hand
-    if nearest_px.shape[0] == 0:
+    if beside.shape[0] == 0:
         return
     for frame in range(1, 16):
         origin = _origin(joints, frame)
@@ -215,9 +215,12 @@ def add_silhouette(seen, lengths, hand, deviation, wrenches):
             u, v = k[0, 0] * x[0] / z + k[0, 2], k[1, 1] * x[1] / z + k[1, 2]
             if not (0 < u < size[1] - 1 and 0 < v < size[0] - 1):
                 continue
-            column = min(max(int(np.rint(u)) - corner[1], 0), nearest_px.shape[1] - 1)
-            line = min(max(int(np.rint(v)) - corner[0], 0), nearest_px.shape[0] - 1)
-            gap_u, gap_v = u - nearest_px[line, column, 0], v - nearest_px[line, column, 1]
+            column = min(max(int(np.rint(u)) - corner[1], 0), beside.shape[1] - 1)
+            line = min(max(int(np.rint(v)) - corner[0], 0), beside.shape[0] - 1)
+            if beside[line, column] == column:  # on it, and so at most a pixel's half from one
+                continue
+            row, place = nearest_solid(beside, line, column)
+            gap_u, gap_v = u - (place + corner[1]), v - (row + corner[0])
             outside = math.sqrt(gap_u * gap_u + gap_v * gap_v)
             if outside <= 1:
                 continue
@@ -392,8 +395,8 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
 
     states: (N, 27) float64, overwritten.  priors: (N, 21).
     keypoints: (N, 21, 3) and (N, 21), or one for all; inf = none.
-    seen: points (P, 3) float32, nearest_px (h, w, 2) and its corner (top, left) in an image of
-        size (height, width), k (3, 3).
+    seen: points (P, 3) float32, beside (h, w) int32 and its corner (top, left) in an image of size
+        (height, width), k (3, 3).
     shape: base_frames, base, lengths, mirror, see pose_hand.
     surface: index (E,), centres (E, 3), axes (E, 3, 3).
     settings: iterations, points, reach_m, point_m, silhouette_px, angle_rad, damping.
@@ -487,7 +490,7 @@ class Refiner:
             known,
             (
                 seen.points_m.contiguous().numpy(),
-                seen.nearest_px.contiguous().numpy(),
+                seen.beside.contiguous().numpy(),
                 seen.corner,
                 seen.size,
                 _array(seen.k),

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import entry_point
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.render.segmentation import Observation
 
 REACH_M = 0.16
@@ -26,13 +26,14 @@ class SeenPoints:
     """What the refinement sees of a frame, once a frame and the same for all hypotheses.
 
     points_m: (P, 3) seen points of the hand and the arm, row by row.
-    nearest_px: (h, w, 2) for each pixel of a crop the nearest pixel (u, v) of the image that is
-        not background. The crop holds all of these and a margin; it is empty where there are none.
+    beside: (h, w) int32, for each pixel of a crop the column, in the crop, of the nearest pixel of
+        its row that is not background; -1 = the row has none. The crop holds all of these and a
+        margin; it is empty where there are none.
     k, size: (3, 3) and (H, W) of the image.  corner: row and column of the crop's first pixel.
     """
 
     points_m: Tensor
-    nearest_px: Tensor
+    beside: Tensor
     k: Tensor
     size: tuple[int, int]
     corner: tuple[int, int] = (0, 0)
@@ -56,42 +57,33 @@ def seen_points(observation: Observation) -> SeenPoints:
     if wide == 0:
         left = top = right = bottom = 0
     part = slice(top, bottom), slice(left, right)
-    k = observation.k.numpy()
-    depth = observation.depth_m.numpy()[part]
-    points = smooth_points(depth, hand[part], (top, left), k)
-    nearest = np.zeros((0, 0, 2), np.float32)
-    if solid[part].size:
-        away, kind = (~solid[part]).view(np.uint8), cv2.DIST_LABEL_PIXEL
-        labels = cv2.distanceTransformWithLabels(
-            away, cv2.DIST_L2, cv2.DIST_MASK_5, labelType=kind
-        )[1]
-        nearest = nearest_of_labels(labels, solid[part], (top, left))
-    return SeenPoints(
-        torch.from_numpy(points),
-        torch.from_numpy(nearest),
-        observation.k,
-        (solid.shape[0], solid.shape[1]),
-        (top, left),
-    )
+    depth, k = observation.depth_m.numpy()[part], observation.k.numpy()
+    points, beside = smooth_points(depth, hand[part], solid[part], (top, left), k)
+    size = solid.shape[0], solid.shape[1]
+    seen = torch.from_numpy(points), torch.from_numpy(beside)
+    return SeenPoints(*seen, observation.k, size, (top, left))
 
 
 def smooth_points(
-    depth_m: np.ndarray, hand: np.ndarray, corner: tuple[int, int], k: np.ndarray
-) -> np.ndarray:
-    """(P, 3) float32 points of the hand's pixels that are on no depth edge, row by row.
+    depth_m: np.ndarray, hand: np.ndarray, solid: np.ndarray, corner: tuple[int, int], k: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """(P, 3) float32 points of the hand's pixels that are on no depth edge, row by row; and
+    SeenPoints.beside.
 
-    depth_m, hand: (h, w) of a crop whose first pixel is at `corner`, row and column.  k: (3, 3).
+    depth_m, hand, solid: (h, w) of a crop whose first pixel is at `corner`, row and column; those
+    of the hand, and all that are not background.  k: (3, 3).
     """
-    points = np.empty((hand.size, 3), np.float32)
-    return points[: _add_points(depth_m, hand, corner, k, points)]
+    points, beside = np.empty((hand.size, 3), np.float32), np.empty(hand.shape, np.int32)
+    return points[: _see(depth_m, hand, solid, corner, k, points, beside)], beside
 
 
 @entry_point
-def _add_points(depth_m, hand, corner, k, points):
+def _see(depth_m, hand, solid, corner, k, points, beside):
     """See smooth_points; how many of `points` (h w, 3) are written."""
     height, width = hand.shape
     count = 0
     for v in range(height):
+        _look_beside(solid[v], beside[v])
         for u in range(width):
             if not hand[v, u]:
                 continue
@@ -109,26 +101,35 @@ def _add_points(depth_m, hand, corner, k, points):
     return count
 
 
-def nearest_of_labels(labels: np.ndarray, solid: np.ndarray, corner: tuple[int, int]) -> np.ndarray:
-    """(h, w, 2) float32: the image's column and row of the nearest solid pixel of a crop.
+@compiled
+def _look_beside(solid, beside):
+    """SeenPoints.beside of a row, (w,)."""
+    width, last = len(solid), np.int32(-1)
+    for u in range(width):
+        last = np.int32(u) if solid[u] else last
+        beside[u] = last
+    last = np.int32(-1)
+    for u in range(width - 1, -1, -1):
+        last = np.int32(u) if solid[u] else last
+        if last >= 0 and (beside[u] < 0 or last - u < u - beside[u]):
+            beside[u] = last
 
-    labels: (h, w) numbers of these pixels, of OpenCV's distance transform.  solid: (h, w) bool.
+
+@compiled
+def nearest_solid(beside, line, column):
+    """Row and column of the pixel nearest to one of the crop that is not background.
+
+    beside: see SeenPoints; some row has one.
     """
-    nearest = np.empty((*solid.shape, 2), np.float32)
-    _look_up(labels, solid, corner, np.zeros((solid.size + 1, 2), np.float32), nearest)
-    return nearest
-
-
-@entry_point
-def _look_up(labels, solid, corner, places, nearest):
-    """See nearest_of_labels; places: (h w + 1, 2) of the labels, and `nearest` are written."""
-    height, width = solid.shape
-    for v in range(height):
-        for u in range(width):
-            if solid[v, u]:
-                places[labels[v, u], 0] = u + corner[1]
-                places[labels[v, u], 1] = v + corner[0]
-    for v in range(height):
-        for u in range(width):
-            nearest[v, u, 0] = places[labels[v, u], 0]
-            nearest[v, u, 1] = places[labels[v, u], 1]
+    height = beside.shape[0]
+    square, row, found = np.int64(height + beside.shape[1]) ** 2, line, column
+    for away in range(height):
+        if away * away >= square:
+            break
+        for v in (line - away, line + away):
+            if v < 0 or v >= height or beside[v, column] < 0:
+                continue
+            gap = np.int64(beside[v, column]) - column
+            if gap * gap + away * away < square:
+                square, row, found = gap * gap + away * away, v, np.int64(beside[v, column])
+    return row, found

@@ -170,7 +170,8 @@ def detected_poses(view: View, count: int) -> Tensor:
     if not cfg.iterations:
         return states
     bent = states[:1]
-    nothing = SeenPoints(bent.new_zeros(0, 3), bent.new_zeros(0, 0, 2), view.observation.k, (0, 0))
+    silhouette = bent.new_zeros(0, 0, dtype=torch.int32)
+    nothing = SeenPoints(bent.new_zeros(0, 3), silhouette, view.observation.k, (0, 0))
     freely = replace(cfg, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
     return torch.cat((view.fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
