@@ -162,7 +162,7 @@ def seen_with(parts: np.ndarray) -> tuple[Observation, Observation, np.ndarray]:
     centre = detection.keypoints.points_m[9].double().numpy()
     detection = replace(detection, parts=Parts(parts, crop_rotation(centre), centre, False))
     observation = view_of(image_of(truth), track_of(truth), detection).observation
-    return observation, without_things(observation, detection), centre
+    return observation, without_things(observation, detection.parts), centre
 
 
 def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import cv2
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from toftrack.detector.hand_detector import Detection, DetectorSettings
-from toftrack.detector.parts import FOREARM_PART, THING_PART
+from toftrack.detector.parts import FOREARM_PART, THING_PART, Parts
 from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -129,9 +129,19 @@ def with_parts(view: View) -> View:
     """The view with its pixels told apart by the pose network: a thing's in the hand are no more
     the hand's, and where it is hidden those of its own arm are, instead of its occluder's.
     """
-    seen = without_things(view.observation, view.detection)
+    seen = without_things(view.observation, view.detection.parts)
     if view.hidden and view.detection.present >= _SURELY_PRESENT:
         seen = with_own_arm(seen, view.detection)
+    if seen is view.observation:
+        return view
+    return replace(view, observation=seen, image=image_term(seen, view.fitted, view.model))
+
+
+def as_last_seen(view: View) -> View:
+    """A predicted view without the pixels that the network's last look at the track's hand called a
+    thing's: in the hand it hardly moves from frame to frame.
+    """
+    seen = without_things(view.observation, view.track.parts)
     if seen is view.observation:
         return view
     return replace(view, observation=seen, image=image_term(seen, view.fitted, view.model))
@@ -141,7 +151,7 @@ def image_term(
     observation: Observation, fitted: FittedHand, model: FilterModel, coverage: float | None = None
 ) -> ImageTerm:
     """The likelihood of an observation, which must not be empty.  coverage: see ImageTerm."""
-    evidence = model.likelihood.evidence(observation).to(model.device)
+    evidence = partial(model.evidence, observation)
     return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
 
 
@@ -254,16 +264,15 @@ def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
     return table.pose[best][None], bool(elsewhere[best])
 
 
-def without_things(observation: Observation, detection: Detection) -> Observation:
+def without_things(observation: Observation, parts: Parts) -> Observation:
     """The observation without the pixels that the pose network calls a thing in the hand.
 
     Else the best pose is one whose fingers explain the thing.
     """
-    kind = detection.parts.kind
-    if observation.empty or np.count_nonzero(kind == THING_PART) < _LEAST_PARTS:
+    if observation.empty or np.count_nonzero(parts.kind == THING_PART) < _LEAST_PARTS:
         return observation
     row, column = np.nonzero(observation.hand.numpy())
-    of = detection.parts.at(_points_of(row, column, observation)) == THING_PART
+    of = parts.at(_points_of(row, column, observation)) == THING_PART
     if not of.any():
         return observation
     mask = np.zeros(observation.hand.shape, bool)

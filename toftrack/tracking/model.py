@@ -26,8 +26,8 @@ from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.likelihood import Likelihood
-from toftrack.render.scoring import Scorer
-from toftrack.render.segmentation import NearestSurface
+from toftrack.render.scoring import Evidence, Scorer
+from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
 from toftrack.tracking.posterior import PosteriorWeights
@@ -162,6 +162,14 @@ class FilterModel:
     @cached_property
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
         return lru_cache(32)(partial(_fitted_hand, self.configured.shape, self.backend))
+
+    def evidence(self, observation: Observation) -> Evidence:
+        """Of an observation, on the particles' device; that of the last few is cached."""
+        return self._evidence(observation)
+
+    @cached_property
+    def _evidence(self) -> Callable[[Observation], Evidence]:
+        return lru_cache(4)(lambda seen: self.likelihood.evidence(seen).to(self.device))
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 27) poses of particles (N, 6 + d), within the joints' limits."""

@@ -8,6 +8,7 @@ are compared by it; the filter weighs its particles by the image alone, sharpene
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -47,15 +48,20 @@ class PosteriorWeights:
 class ImageTerm:
     """The likelihood of the image: the log of the F-measure, and of how much is explained.
 
-    evidence: on the scorer's device.
+    evidence_of: makes the evidence, on the scorer's device, when it is first asked for.
     coverage: weight of how much is explained; None = the likelihood's own.
     """
 
     likelihood: Likelihood
     scorer: Scorer
-    evidence: Evidence
+    evidence_of: Callable[[], Evidence]
     device: torch.device
     coverage: float | None = None
+
+    @property
+    def evidence(self) -> Evidence:
+        """What poses are compared with."""
+        return self.evidence_of()
 
     def __call__(self, poses: Tensor) -> Tensor:
         """(N,) log values of poses (N, 27), all on the CPU."""

@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.hand_detector import Detection
+from toftrack.detector.parts import ALL_HAND, Parts
 from toftrack.detector.proposals import Places
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import DepthImage
@@ -81,7 +82,7 @@ class Track:
     whole_odds: that its mean error is, likewise.
     confirmed: one of its estimates was believed; until then the track is tentative.
     believed_s: since the last believed estimate, or since it began; 0 = the last one is not lost.
-    asked_s: since the pose network looked at it.  looked: what it said then.
+    asked_s: since the pose network looked at it.  parts: which pixels it called what then.
     features: of the last estimate, see confidence.py.
     nearest_m: while something hides part of the hand, the depth that its nearest joint was expected
         at; 0 while nothing does.
@@ -103,7 +104,7 @@ class Track:
     confirmed: bool = False
     believed_s: float = 0.0
     asked_s: float = 0.0
-    looked: Detection = NO_DETECTION
+    parts: Parts = ALL_HAND
     features: ConfidenceFeatures = NO_FEATURES
     nearest_m: float = 0.0
 

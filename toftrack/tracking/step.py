@@ -14,7 +14,7 @@ from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import associate, keep_tracks
-from toftrack.tracking.candidates import View, propose, select, with_parts
+from toftrack.tracking.candidates import View, as_last_seen, propose, select
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
@@ -111,13 +111,6 @@ def rest_track(scene: Scene, row: int) -> Track:
     )
 
 
-def as_last_seen(view: View) -> View:
-    """A predicted view with its pixels told apart by the network's last look at the track's hand:
-    things in a hand, and its arm, hardly move in it from frame to frame.
-    """
-    return with_parts(changed(view, detection=view.track.looked))
-
-
 def filter_tracks(
     views: Sequence[View],
     state: TrackerState,
@@ -181,7 +174,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         confirmed=track.confirmed or believed,
         believed_s=0.0 if believed else track.believed_s + dt_s,
         asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
-        looked=track.looked if view.detection.empty else view.detection,
+        parts=track.parts if view.detection.empty else view.detection.parts,
         features=features,
         nearest_m=view.expected_m if view.hidden else 0.0,
     )

@@ -136,7 +136,7 @@ def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: s
 
 def restart_track(view: View) -> Track:
     """The track at the best pose of the view's detection, with age 0: still of the same hand."""
-    model, seen = view.model, without_things(view.observation, view.detection)
+    model, seen = view.model, without_things(view.observation, view.detection.parts)
     # Very different poses are compared: what explains more of the image counts in full.
     image = image_term(seen, view.fitted, model, coverage=1.0)
     pose, _ = best_start(replace(view, observation=seen, image=image))
