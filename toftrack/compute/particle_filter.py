@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.compute.rigid import BOUNDS, Redraw
 from toftrack.errors import ToftrackError, check_number
 
@@ -104,16 +105,30 @@ def normalise(log_weights: Tensor) -> Tensor:
     diffuses on without evidence instead of failing.
     """
     if log_weights.device.type == "cpu":  # where each of torch's operations takes longer
-        given = log_weights.numpy()
-        w = np.where(np.isnan(given), -np.inf, given.astype(np.float64))
-        w = np.minimum(w, 1e300)
-        top = w.max(-1, keepdims=True)
-        w = np.exp(w - np.where(np.isfinite(top), top, np.inf)) + ~np.isfinite(top)
-        return torch.from_numpy(w / w.sum(-1, keepdims=True))
+        given = log_weights.double().numpy().reshape(-1, log_weights.shape[-1])
+        weights = np.empty(given.shape)
+        _normalise_rows(given, weights)
+        return torch.from_numpy(weights.reshape(log_weights.shape))
     x = log_weights.double().nan_to_num(nan=-math.inf, neginf=-math.inf, posinf=1e300)
     most = x.amax(-1, keepdim=True)
     x = torch.where(most.isfinite(), (x - most).exp(), torch.ones_like(x))
     return x / x.sum(-1, keepdim=True)
+
+
+@entry_point
+def _normalise_rows(log_weights, weights):
+    """See normalise; log_weights, weights: (B, N) float64."""
+    for row in range(len(weights)):
+        given, out = log_weights[row], weights[row]
+        most, total = -np.inf, 0.0
+        for i in range(len(out)):
+            out[i] = min(given[i], 1e300) if given[i] > -np.inf else -np.inf  # also for NaN
+            most = max(most, out[i])
+        for i in range(len(out)):
+            out[i] = math.exp(out[i] - most) if most > -np.inf else 1.0
+            total += out[i]
+        for i in range(len(out)):
+            out[i] /= total
 
 
 def effective_sample_size(weights: Tensor) -> Tensor:
@@ -129,6 +144,8 @@ def draw_positions(scheme: str, n: int, generator: torch.Generator) -> Tensor:
     """
     device, count = generator.device, 1 if scheme == "systematic" else n
     offset = torch.rand(count, generator=generator, device=device, dtype=torch.float64)
+    if device.type == "cpu":  # where each of torch's operations takes longer
+        return torch.from_numpy((np.arange(n) + offset.numpy()) / n)
     return (torch.arange(n, device=device) + offset) / n
 
 

@@ -16,6 +16,8 @@ from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid import PIVOT_M, Motions
 
 _PIVOT = np.array(PIVOT_M)
+_SQUARINGS = 24
+"""So often is a matrix squared of which only the main axis is to be left."""
 
 
 @compiled
@@ -161,6 +163,38 @@ def difference_rows(particles, reference, pivot, out):
             out[i, j] = p[j] - r[j]
 
 
+@entry_point
+def mean_row(particles, weights, out):
+    """See rigid.mean; particles: (N, 6 + d) float32, weights: (N,) float64, out: (6 + d,)."""
+    sums = np.zeros(len(out), np.float64)
+    scatter, square = np.zeros((4, 4), np.float64), np.empty((4, 4), np.float64)
+    for row in range(len(weights)):
+        p, weight = particles[row], weights[row]
+        q = quaternion(np.float64(p[3]), np.float64(p[4]), np.float64(p[5]))
+        for i in range(4):
+            for j in range(4):
+                scatter[i, j] += weight * q[i] * q[j]
+        for j in range(len(out)):
+            sums[j] += weight * p[j]
+    # A column of a high power is along the main axis, which is the mean rotation's quaternion.
+    for _ in range(_SQUARINGS):
+        trace = scatter[0, 0] + scatter[1, 1] + scatter[2, 2] + scatter[3, 3]
+        for i in range(4):
+            for j in range(4):
+                square[i, j] = 0.0
+                for k in range(4):
+                    square[i, j] += scatter[i, k] * scatter[k, j] / (trace * trace)
+        scatter, square = square, scatter
+    most = 0
+    for i in range(4):
+        most = i if scatter[i, i] > scatter[most, most] else most
+    x, y, z, w = scatter[most, 0], scatter[most, 1], scatter[most, 2], scatter[most, 3]
+    size = math.sqrt(x * x + y * y + z * z + w * w)
+    vector = rotation_vector((x / size, y / size, z / size, w / size))
+    for j in range(len(out)):
+        out[j] = sums[j] if j < 3 or j > 5 else vector[j - 3]
+
+
 @compiled
 def pose_hand(state, base_frames, base, lengths, mirror, frames, joints):
     """Frames and joints of one hand, see skeleton.forward_kinematics; all float64.
@@ -262,21 +296,9 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
 
 def mean(particles: Tensor, weights: Tensor) -> Tensor:
     """See rigid.mean; on the CPU, in float32."""
-    rows, shares = particles.double().numpy(), weights.double().numpy()
-    found = shares @ rows
-    half = 0.5 * rows[:, 3:6]
-    angle = np.sqrt((half * half).sum(1, keepdims=True))
-    q = np.concatenate((np.sinc(angle / math.pi) * half, np.cos(angle)), 1)
-    scatter = (q * shares[:, None]).T @ q
-    # The mean rotation's quaternion is the main axis of all, see rigid.mean.
-    found[3:6] = np.nan
-    if np.isfinite(scatter).all():
-        main = np.linalg.eigh(scatter)[1][:, -1]
-        main *= 1.0 if main[3] >= 0 else -1.0
-        sine = math.sqrt(main[:3] @ main[:3])
-        # At a small angle, 2 atan(sine / cosine) / sine is 2 / cosine.
-        found[3:6] = main[:3] * (2 * math.atan2(sine, main[3]) / sine if sine > 1e-9 else 2.0)
-    return torch.from_numpy(found[None].astype(np.float32))
+    out = np.empty((1, particles.shape[1]), np.float32)
+    mean_row(_rows(particles), weights.double().numpy(), out[0])
+    return torch.from_numpy(out)
 
 
 def _rows(tensor: Tensor) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass, replace
 from typing import Any
@@ -184,4 +185,12 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     median = median_reading(depth) if farthest > LARGEST_MEDIAN_M else 0.0
     if median > LARGEST_MEDIAN_M and not math.isclose(median, _FULL_WORD_M, rel_tol=1e-6):
         raise wrong_unit("the depth image", depth)
-    return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K
+    if matrix.shape != (3, 3) or matrix.dtype != np.float64:
+        return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K
+    return depth, _intrinsics(matrix.tobytes(), depth.shape[1], depth.shape[0])
+
+
+@functools.lru_cache(16)
+def _intrinsics(entries: bytes, width: int, height: int) -> np.ndarray:
+    """(3, 3) float64 that Camera accepts: most frames have the ones of the frame before."""
+    return Camera(np.frombuffer(entries).reshape(3, 3), width, height).K

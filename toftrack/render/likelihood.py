@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
-from typing import TypeVar
 
 import numpy as np
 import torch
@@ -16,7 +16,6 @@ from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import Observation
 
 _LEAST_M = np.float32(1e-3)
-Values = TypeVar("Values", Tensor, np.ndarray)
 NAMINGS = ("printed", "standard")
 
 
@@ -119,30 +118,51 @@ class FMeasure(Likelihood):
         """See Likelihood."""
         coverage = self.coverage if coverage is None else coverage
         if counts.correct.device.type == "cpu":
-            host = _host(counts)
-            with np.errstate(divide="ignore"):
-                found: np.ndarray = np.log(self._f_measure(*host))
-                if coverage:
-                    found = found + np.float32(coverage) * np.log(host[0])
-            return torch.from_numpy(found)
+            return self._on_host(counts, coverage, logarithm=True)
         return super().log_score(counts, coverage)
 
     def score(self, counts: Counts) -> Tensor:
         """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
         if counts.correct.device.type == "cpu":
-            return torch.from_numpy(self._f_measure(*_host(counts)))
-        return self._f_measure(*counts)
-
-    def _f_measure(
-        self, correct: Values, false: Values, missed: Values, residual: Values
-    ) -> Values:
-        taken, b2 = self.residual_weight * residual, self.beta**2
+            return self._on_host(counts, 0.0, logarithm=False)
+        correct, false, missed, residual = counts
+        taken, (of_false, of_missed) = self.residual_weight * residual, self._weights
         # What the residual takes from correct, it gives to false: F only falls.
         correct, false = correct - taken, false + taken
-        printed = self.naming == "printed"
-        rest = b2 * false + missed if printed else false + b2 * missed
-        weighted = (1 + b2) * correct
+        weighted = (1 + self.beta**2) * correct
+        rest = of_false * false + of_missed * missed
         return weighted / (weighted + rest).clip(min=1e-9)
+
+    @property
+    def _weights(self) -> tuple[float, float]:
+        """Of false and of missed pixels."""
+        return (self.beta**2, 1.0) if self.naming == "printed" else (1.0, self.beta**2)
+
+    def _on_host(self, counts: Counts, coverage: float, logarithm: bool) -> Tensor:
+        """The same in compiled code: on the CPU each operation takes longer than its arithmetic."""
+        given = [np.ascontiguousarray(count.numpy(), np.float32).ravel() for count in counts]
+        found = np.empty(counts.correct.shape, np.float32)
+        numbers = 1 + self.beta**2, *self._weights, self.residual_weight, coverage
+        _f_measures(*given, tuple(map(np.float32, numbers)), logarithm, found.reshape(-1))
+        return torch.from_numpy(found)
+
+
+@entry_point
+def _f_measures(correct, false, missed, residual, numbers, logarithm, found):
+    """See FMeasure.score and log_score; all (N,) float32.
+
+    numbers: 1 + beta^2, weights of false and of missed pixels, residual_weight, coverage.
+    """
+    more, of_false, of_missed, weight, coverage = numbers
+    for i in range(len(found)):
+        taken = weight * residual[i]
+        weighted = more * (correct[i] - taken)
+        rest = of_false * (false[i] + taken) + of_missed * missed[i]
+        found[i] = weighted / max(weighted + rest, np.float32(1e-9))
+        if logarithm:
+            found[i] = math.log(found[i])
+            if coverage > 0:
+                found[i] += coverage * math.log(correct[i])
 
 
 def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
@@ -155,10 +175,3 @@ def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
         f"likelihood: {type(likelihood).__name__}.score gives {found.tolist()} where correct is"
         f" {counts.correct.tolist()}; let it give (N,) numbers of 0 to 1, and 0 where that is 0"
     )
-
-
-def _host(counts: Counts) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    # On the CPU each of torch's operations takes longer than its arithmetic.
-    given = (np.asarray(count.numpy(), np.float32) for count in counts)
-    correct, false, missed, residual = given
-    return correct, false, missed, residual

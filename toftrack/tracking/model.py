@@ -21,7 +21,7 @@ from toftrack.gestures.recognition import Gestures
 from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.hand.shape_space import shape_derivatives, shaped
-from toftrack.pose_space.base import PoseSpace, clamp_to_joint_limits
+from toftrack.pose_space.base import PoseSpace
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
@@ -173,7 +173,7 @@ class FilterModel:
 
     def decode(self, particles: Tensor) -> Tensor:
         """(N, 27) poses of particles (N, 6 + d), within the joints' limits."""
-        angles = clamp_to_joint_limits(self.space_of(particles).decode(particles[:, 6:]))
+        angles = self.space_of(particles).decode(particles[:, 6:])
         return torch.cat((particles[:, :6], angles), 1)
 
     def encode(self, states: Tensor) -> Tensor:
