@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
+from toftrack.compute.compiling import entry_point
 from toftrack.detector.crops import CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 
 BACKGROUND_PART, HAND_PART, FOREARM_PART, ANOTHER_PART, THING_PART = range(SEGMENTS)
 """Of the classes, see network.SEGMENTS."""
-_MIRROR = np.array([-1.0, 1.0, 1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +30,29 @@ class Parts:
 
     def at(self, points_m: np.ndarray, outside: int = BACKGROUND_PART) -> np.ndarray:
         """(P,) classes of seen points (P, 3), camera frame; `outside` where the crop ends."""
-        points = points_m * _MIRROR if self.mirrored else points_m
-        away = (points @ self.turn).T
-        distance = float(np.linalg.norm(self.centre_m))
-        across, down = away[:2] * (distance / CROP_M) / np.maximum(away[2], 1e-6) + 0.5
-        column, row = (np.floor(PARTS * side).astype(int) for side in (across, down))
-        inside = (column >= 0) & (column < PARTS) & (row >= 0) & (row < PARTS)
-        inside &= np.abs(away[2] - distance) < CROP_M / 2
-        kind = self.kind[np.where(inside, row, 0), np.where(inside, column, 0)]
-        return np.where(inside, kind, outside)
+        points = np.ascontiguousarray(points_m, np.float64)
+        found = np.empty(len(points), np.uint8)
+        crop = self.kind, np.ascontiguousarray(self.turn), self.centre_m, self.mirrored
+        _classes(points, *crop, np.uint8(outside), found)
+        return found
+
+
+@entry_point
+def _classes(points, kind, turn, centre, mirrored, outside, found):
+    """See Parts.at; points: (P, 3) float64, found: (P,) uint8."""
+    parts = kind.shape[0]
+    distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
+    for p in range(len(points)):
+        x, y, z = -points[p, 0] if mirrored else points[p, 0], points[p, 1], points[p, 2]
+        across = x * turn[0, 0] + y * turn[1, 0] + z * turn[2, 0]
+        down = x * turn[0, 1] + y * turn[1, 1] + z * turn[2, 1]
+        away = x * turn[0, 2] + y * turn[1, 2] + z * turn[2, 2]
+        scale = distance / CROP_M / max(away, 1e-6)
+        column, row = parts * (across * scale + 0.5), parts * (down * scale + 0.5)
+        found[p] = outside
+        inside = 0 <= column < parts and 0 <= row < parts
+        if inside and abs(away - distance) < CROP_M / 2:
+            found[p] = kind[int(row), int(column)]
 
 
 ALL_HAND = Parts(

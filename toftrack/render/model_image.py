@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import functools
+import math
 
 import numpy as np
 import torch
 
-from toftrack.compute.compiling import entry_point
+from toftrack.compute.compiling import compiled, entry_point
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
@@ -41,69 +42,77 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
 
     ellipsoids: (1, E).  k: (3, 3).
     """
-    k = np.asarray(k, np.float32)
-    linear, quadratic, boxes = _projected(ellipsoids, k, height, width)
-    x = (np.arange(width, dtype=np.float32) - k[0, 2]) / k[0, 0]
-    y = (np.arange(height, dtype=np.float32) - k[1, 2]) / k[1, 1]
+    centres, axes = ellipsoids.centres_m[0].numpy(), ellipsoids.axes_m[0].numpy()
     image = np.zeros((height, width), np.float32)
-    _draw(linear, quadratic, boxes, x, y, image)
+    _draw(np.ascontiguousarray(centres), np.ascontiguousarray(axes), np.array(k, np.float64), image)
     return image
 
 
 @entry_point
-def _draw(linear, quadratic, boxes, x, y, image):
-    """Z of the nearest of E ellipsoids, into an image of zeros.
+def _draw(centres, axes, k, image):
+    """Z of the nearest of E ellipsoids, (E, 3) and (E, 3, 3), into an image of zeros.  k: (3, 3).
 
-    linear, quadratic, boxes: see _projected.  x, y: slopes of the columns' and rows' rays.
+    The formulas are those of closed_form.project.
     """
     height, width = image.shape
-    for e in range(len(boxes)):
-        left, right, top, bottom = boxes[e]
-        if right <= left or bottom <= top:
+    linear, quadratic, box = np.empty(3), np.empty((3, 3)), np.empty(4, np.int64)
+    for e in range(len(centres)):
+        if not _project(centres[e], axes[e], k, height, width, linear, quadratic, box):
             continue
-        line, q = linear[e], quadratic[e]
-        for row in range(max(0, top - 1), min(height, bottom + 1)):
-            py = y[row]
-            for column in range(max(0, left - 1), min(width, right + 1)):
-                px = x[column]
-                square = (q[0, 0] * px + 2 * q[0, 2]) * px + (q[1, 1] * py + 2 * q[1, 2]) * py
-                square += q[2, 2] + 2 * q[0, 1] * px * py
+        l0, l1, l2 = np.float32(linear[0]), np.float32(linear[1]), np.float32(linear[2])
+        xx, xy, xz = quadratic[0, 0], quadratic[0, 1], quadratic[0, 2]
+        yy, yz, zz = quadratic[1, 1], quadratic[1, 2], quadratic[2, 2]
+        for row in range(box[2], box[3]):
+            y = (row - k[1, 2]) / k[1, 1]
+            for column in range(box[0], box[1]):
+                x = (column - k[0, 2]) / k[0, 0]
+                square = (xx * x + 2 * xz) * x + (yy * y + 2 * yz) * y + zz + 2 * xy * x * y
                 if square >= 0:
-                    u = line[0] * px + line[1] * py + line[2] + np.sqrt(square)
-                    image[row, column] = max(image[row, column], u)
+                    inverse = l0 * x + l1 * y + l2 + math.sqrt(square)
+                    image[row, column] = max(image[row, column], np.float32(inverse))
     for row in range(height):
         for column in range(width):
             if image[row, column] > 0:
                 image[row, column] = 1 / image[row, column]
 
 
-def _projected(
-    ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Linear (E, 3) and quadratic (E, 3, 3) parts of inverse depths, as closed_form.project, which
-    takes as long for one hand as all the drawing; and boxes (E, 4): left, right, top, bottom.
+@compiled
+def _project(centre, axes, k, height, width, linear, quadratic, box):
+    """Linear (3,) and quadratic (3, 3) parts of an ellipsoid's inverse depth, and its box: left,
+    right, top, bottom, a pixel wider than it; False where it is not before the camera.
     """
-    centres, axes = ellipsoids.centres_m[0].numpy(), ellipsoids.axes_m[0].numpy()
-    turned = axes.swapaxes(1, 2)
-    whiten = turned / np.square(axes).sum(1)[..., None]
-    s = (whiten @ centres[..., None])[..., 0]
-    visible = centres[:, 2] - np.sqrt(np.square(axes[:, 2]).sum(1)) > _NEAREST_M
-    g = np.where(visible, np.square(s).sum(1) - 1, np.float32(1))[:, None]
-    back = whiten.swapaxes(1, 2)
-    linear = (back @ s[..., None])[..., 0] / g
-    quadratic = linear[..., None] * linear[:, None] - back @ whiten / g[..., None]
-    dual = axes @ turned - centres[..., None] * centres[:, None]
-    size = np.array([width, height], np.float32)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = dual[:, :2, 2] / dual[:, 2:, 2]
-        own = dual[:, [0, 1], [0, 1]] / dual[:, 2:, 2]
-        spread = np.sqrt(np.maximum(np.square(mean) - own, 0))
-        focal, middle = k[[0, 1], [0, 1]], k[:2, 2]
-        low = np.ceil(focal * (mean - spread) + middle).clip(0, size)
-        high = (np.floor(focal * (mean + spread) + middle) + 1).clip(0, size)
-    high = np.where(visible[:, None], high, low)
-    boxes = np.stack((low[:, 0], high[:, 0], low[:, 1], high[:, 1]), 1)
-    return linear, quadratic, np.nan_to_num(boxes, nan=0).astype(np.int64)
+    whiten, s, square, reach = np.empty((3, 3)), np.zeros(3), 0.0, 0.0
+    for j in range(3):
+        size = axes[0, j] ** 2 + axes[1, j] ** 2 + axes[2, j] ** 2
+        reach += axes[2, j] ** 2
+        for i in range(3):
+            whiten[j, i] = axes[i, j] / size
+            s[j] += whiten[j, i] * centre[i]
+        square += s[j] * s[j]
+    if not centre[2] - math.sqrt(reach) > _NEAREST_M:
+        return False
+    for i in range(3):
+        back = whiten[0, i] * s[0] + whiten[1, i] * s[1] + whiten[2, i] * s[2]
+        linear[i] = back / (square - 1)
+    for i in range(3):
+        for j in range(3):
+            both = 0.0
+            for row in range(3):
+                both += whiten[row, i] * whiten[row, j]
+            quadratic[i, j] = linear[i] * linear[j] - both / (square - 1)
+    last = reach - centre[2] * centre[2]
+    for i in range(2):
+        own, mixed = -centre[i] * centre[i], -centre[i] * centre[2]
+        for j in range(3):
+            own += axes[i, j] * axes[i, j]
+            mixed += axes[i, j] * axes[2, j]
+        mean = mixed / last
+        spread = math.sqrt(max(mean * mean - own / last, 0.0))
+        most = float(width if i == 0 else height)
+        low = math.ceil(k[i, i] * (mean - spread) + k[i, 2]) - 1.0
+        high = math.floor(k[i, i] * (mean + spread) + k[i, 2]) + 2.0
+        box[2 * i], box[2 * i + 1] = int(min(max(low, 0.0), most)), int(min(max(high, 0.0), most))
+    return True
 
 
 def model_range_image(
