@@ -51,15 +51,7 @@ def test_the_middle_of_the_palm_stays_whatever_the_size(ratio: float) -> None:
     turned = roma.rotvec_to_rotmat(states[:, 3:6]) @ (torch.tensor(PIVOT_M) * ratio)
     assert torch.allclose(states[:, :3] + turned, seen.pivot_m, atol=1e-6)
     assert torch.equal(states[:, 6:], seen.angles)
-
-
-def test_only_the_first_hypotheses_are_kept() -> None:
-    seen = detection()
-    kept = seen.first(3)
-    assert len(kept.pivot_m) == len(kept.angles) == len(kept.log_probability) == 3
-    assert torch.equal(kept.joints_m, seen.joints_m[:3])
-    assert kept.keypoints is seen.keypoints and kept.present == seen.present
-    assert torch.equal(kept.centre_m, seen.centre_m)
+    assert torch.equal(seen.states(ratio, 3), states[:3])
 
 
 def test_a_hand_s_length_is_the_mean_of_the_hypotheses() -> None:

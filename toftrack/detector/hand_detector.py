@@ -92,11 +92,15 @@ class Detection:
     heat: float = 1.0
     merit: float = math.inf
 
-    def states(self, ratio: float) -> Tensor:
-        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle."""
-        states = np.zeros((len(self.rotvec), 27), np.float32)
-        states[:, 3:6], states[:, 6:] = self.rotvec.numpy(), self.angles.numpy()
-        states[:, :3] = self.pivot_m.numpy() - np.float32(ratio) * pivot_offset(states[:, 3:6])
+    def states(self, ratio: float, count: int | None = None) -> Tensor:
+        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle.
+
+        count: of so many hypotheses at most; None = all.
+        """
+        pivot, rotvec = self.pivot_m.numpy()[:count], self.rotvec.numpy()[:count]
+        states = np.empty((len(rotvec), 27), np.float32)
+        states[:, 3:6], states[:, 6:] = rotvec, self.angles.numpy()[:count]
+        states[:, :3] = pivot - np.float32(ratio) * pivot_offset(rotvec)
         return torch.from_numpy(states)
 
     @property
@@ -120,10 +124,6 @@ class Detection:
         """(3,) where its fingers point: from the wrist to the middle finger's knuckle."""
         wrist, knuckle = self.keypoints.points_m[[0, 9]].numpy()
         return np.asarray(knuckle - wrist)
-
-    def first(self, count: int) -> Detection:
-        """With only so many hypotheses."""
-        return replace(self, **{name: getattr(self, name)[:count] for name in _OF_HYPOTHESES})
 
 
 NO_DETECTION = Detection(

@@ -192,16 +192,16 @@ def with_network_length(
 
 def weight_of(detection: SeenHand) -> float:
     """How much a detection of the hand counts, at most 1."""
-    sigma = float(detection.keypoints.sigma_m.square().mean().sqrt())
+    sigma = float(np.sqrt(np.square(detection.keypoints.sigma_m.numpy()).mean()))
     weight = min(1.0, (_SURE_M / max(sigma, 1e-6)) ** 4)
     return weight if math.isfinite(weight) else 0.0
 
 
 def contradicted(estimate: ShapeEstimate, detection: SeenHand, first: HandShape) -> ShapeEstimate:
     """The estimate after one more frame, believed or not; begun anew where detections disagree."""
-    estimate = replace(estimate, frames=estimate.frames + 1)
-    if not estimate.poses or estimate.frames % EVERY:
-        return estimate
+    frames = estimate.frames + 1
+    if not estimate.poses or frames % EVERY:
+        return replace(estimate, frames=frames)
     weight = weight_of(detection) * detection.present
     keep = 1 - 1 / _MEMORY
     log_length = math.log(detection.length_m / first.hand_length_m)
@@ -212,7 +212,7 @@ def contradicted(estimate: ShapeEstimate, detection: SeenHand, first: HandShape)
     expected = math.sqrt(error + float(estimate.covariance[0, 0]))
     if considered > 1 and abs(off / considered) > _CONTRADICTION * expected:
         return with_network_length(first_shape(), detection.length_m, first)
-    return replace(estimate, off=off, considered=considered)
+    return replace(estimate, frames=frames, off=off, considered=considered)
 
 
 def learned(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 
 import cv2
 import numpy as np
@@ -18,7 +18,7 @@ from torch import Tensor
 from toftrack.detector.hand_detector import Detection, DetectorSettings
 from toftrack.detector.parts import FOREARM_PART, THING_PART, Parts
 from toftrack.hand.overlap import finger_overlap
-from toftrack.refinement.gauss_newton import Keypoints
+from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
@@ -165,7 +165,7 @@ def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: floa
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
     """(H, 27) the likely hypotheses, `count` at most, as poses of a hand; the best one at least."""
     likely = int((detection.log_probability.numpy() > math.log(_UNLIKELY)).sum())
-    return detection.first(max(1, min(count, likely))).states(fitted.ratio)
+    return detection.states(fitted.ratio, max(1, min(count, likely)))
 
 
 def detected_poses(view: View, count: int) -> Tensor:
@@ -182,9 +182,16 @@ def detected_poses(view: View, count: int) -> Tensor:
     bent = states[:1]
     silhouette = bent.new_zeros(0, 0, dtype=torch.int32)
     nothing = SeenPoints(bent.new_zeros(0, 3), silhouette, view.observation.k, (0, 0))
-    freely = replace(cfg, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
     keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
-    return torch.cat((view.fitted.refiner(bent, bent[:, 6:], nothing, freely, keypoints), states))
+    return torch.cat(
+        (view.fitted.refiner(bent, bent[:, 6:], nothing, _freely(cfg), keypoints), states)
+    )
+
+
+@lru_cache
+def _freely(settings: Refinement) -> Refinement:
+    """The refinement by which a pose is bent to keypoints."""
+    return replace(settings, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
 
 
 def best_start(view: View) -> tuple[Tensor, float]:

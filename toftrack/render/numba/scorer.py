@@ -51,8 +51,10 @@ class NumbaScorer:
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
-        counts = score_rows([self], states[None], [evidence])
-        return Counts(*(one[0] for one in counts))
+        x = _array(states, np.float32)
+        counts = np.empty((4, len(x)), np.float32)
+        run_shared(self.task(x, evidence, counts), len(x) // _WORTH_A_THREAD)
+        return Counts(*torch.from_numpy(counts).to(states.device).unbind(0))
 
     def task(
         self, states: np.ndarray, evidence: Evidence, counts: np.ndarray
