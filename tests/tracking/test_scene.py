@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +16,7 @@ from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
 from toftrack.render.reference import ReferenceScorer
-from toftrack.tracking.scene import Scene
+from toftrack.tracking.scene import Scene, _own
 from toftrack.tracking.views import expected_of
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -138,3 +139,28 @@ def test_hands_are_predicted_where_they_move_to() -> None:
     assert here == pytest.approx(detection_of(hand_at()).centre_m.numpy(), abs=0.01)
     assert 0.2 * 0.8 * scene.dt_s < moved[0] - here[0] <= 0.8 * scene.dt_s
     assert moved[1:] == pytest.approx(here[1:], abs=1e-3)
+
+
+@pytest.mark.parametrize("hands", [1, 2, 3])
+def test_owners_are_those_of_whole_images(hands: int) -> None:
+    """As with operations on whole images; cv2.dilate takes the largest of 3 x 3 pixels."""
+    draw, size = np.random.default_rng(hands), (60, 80)
+    surfaces = np.zeros((hands, *size), np.float32)
+    for row, surface in enumerate(surfaces):
+        disc = cv2.circle(np.zeros(size, np.uint8), (30 + 12 * row, 28), 14, 1, -1) > 0
+        surface[disc] = 0.5 + 0.03 * row + 0.02 * draw.random(np.count_nonzero(disc))
+    near = np.where(surfaces > 0, surfaces, 0.8).min(0) + 0.012 * draw.standard_normal(size)
+    depth = np.where(draw.random(size) < 0.2, 0, near + 0.05 * (draw.random(size) < 0.3))
+    depth, reliable = depth.astype(np.float32), np.arange(hands) != 1
+    there = (surfaces > 0) & (depth > 0)
+    off = np.where(there, np.abs(surfaces - depth), np.inf)
+    nearest, sure = off.argmin(0), off.min(0) < 0.02
+    expected = np.full(size, -1, np.int8)
+    for row in np.flatnonzero(reliable):
+        own = sure & (nearest == row)
+        around = cv2.dilate(np.where(own, surfaces[row], 0), np.ones((3, 3)))
+        mixed = (around > 0) & ~sure & (depth > around) & (depth < around + 0.06)
+        expected[own | mixed] = row
+    found = np.full(size, -1, np.int8)
+    _own(depth, surfaces, reliable, np.empty_like(found), found)
+    np.testing.assert_array_equal(found, expected)

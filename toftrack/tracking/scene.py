@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 import torch
 
+from toftrack.compute.compiling import entry_point
 from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
@@ -18,7 +19,7 @@ from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
-_TOLERANCE_M, _EDGE_M = 0.02, 0.06
+_TOLERANCE_M, _EDGE_M = np.float32(0.02), np.float32(0.06)
 """A pixel whose depth is so near to a predicted surface is that hand's; those on its outline, which
 mix its depth with what is behind, are up to the latter farther."""
 _FAR_M = 5.0
@@ -80,26 +81,8 @@ class Scene:
         mixes with what is behind. A track that is not reliable owns no pixels.
         """
         owner = np.full(self.depth_m.shape, -1, np.int8)
-        rows, columns = (np.flatnonzero((self._surfaces > 0).any((0, axis))) for axis in (2, 1))
-        if not len(rows):
-            return owner
-        # Within their box, and a pixel around: most of the image is far from them.
-        box = (
-            slice(max(rows[0] - 1, 0), rows[-1] + 2),
-            slice(max(columns[0] - 1, 0), columns[-1] + 2),
-        )
-        depth_m, surfaces = self.depth_m[box], self._surfaces[:, *box]
-        there = (surfaces > 0) & (depth_m > 0)
-        off = np.where(there, np.abs(surfaces - depth_m), np.float32(np.inf))
-        nearest, sure = off.argmin(0), off.min(0) < _TOLERANCE_M
-        for row, hand in enumerate(self.hands):
-            if not hand.track.reliable:
-                continue
-            surface = sure & (nearest == row)
-            near = cv2.dilate(surface.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            around = cv2.dilate(np.where(surface, surfaces[row], 0), np.ones((3, 3), np.float32))
-            mixed = near & ~sure & (depth_m > around) & (depth_m < around + _EDGE_M)
-            owner[box][surface | mixed] = row
+        reliable = np.array([hand.track.reliable for hand in self.hands], np.bool_)
+        _own(self.depth_m, self._surfaces, reliable, np.empty_like(owner), owner)
         return owner
 
     def owned_by_others(self, row: int) -> np.ndarray | None:
@@ -149,3 +132,34 @@ class Scene:
         return tuple(
             hand.joints_m for at, hand in enumerate(self.hands) if at != row and hand.track.reliable
         )
+
+
+@entry_point
+def _own(depth, surfaces, reliable, nearest, owner):
+    """See Scene.owners; surfaces: (B, H, W), reliable: (B,) bool.
+
+    nearest: (H, W) int8, written: the row of the surface that a pixel is of, -1 = of none.
+    owner: (H, W) int8 of -1.
+    """
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            nearest[v, u], least = -1, _TOLERANCE_M
+            for row in range(len(surfaces)):
+                there = surfaces[row, v, u] > 0 and depth[v, u] > 0
+                if there and abs(surfaces[row, v, u] - depth[v, u]) < least:
+                    nearest[v, u], least = row, abs(surfaces[row, v, u] - depth[v, u])
+    for v in range(height):
+        for u in range(width):
+            if nearest[v, u] >= 0:
+                owner[v, u] = nearest[v, u] if reliable[nearest[v, u]] else -1
+                continue
+            for row in range(len(surfaces)):
+                around = np.float32(0)
+                for y in range(max(v - 1, 0), min(v + 2, height)):
+                    for x in range(max(u - 1, 0), min(u + 2, width)):
+                        if nearest[y, x] == row:
+                            around = max(around, surfaces[row, y, x])
+                mixed = around > 0 and around < depth[v, u] < around + _EDGE_M
+                if mixed and reliable[row]:
+                    owner[v, u] = row
