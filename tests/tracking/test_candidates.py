@@ -59,8 +59,8 @@ def proposed(view: View) -> Hypotheses:
 def test_each_source_proposes_its_poses_and_all_are_scored_by_the_posterior() -> None:
     view = viewed(-0.1, 1)
     table = proposed(view)
-    # The last frame's fingers and the filter's; the detector's as it is, and bent to the keypoints.
-    assert table.detected.tolist() == [False, False, True, True]
+    # The last frame's fingers and the filter's; the detector's, bent to the keypoints.
+    assert table.detected.tolist() == [False, False, True]
     torch.testing.assert_close(table.log_posterior, view.log_posterior(table.pose))
 
 
@@ -222,7 +222,7 @@ def test_a_hand_that_is_mostly_covered_is_held_where_it_was() -> None:
     near, everything = torch.full_like(seen.depth_m, 0.3), torch.ones_like(seen.occluder)
     table = proposed(replace(view, observation=replace(seen, depth_m=near, occluder=everything)))
     assert torch.equal(table.pose, view.track.pose)
-    assert len(proposed(view).pose) == 4
+    assert len(proposed(view).pose) == 3
 
 
 # Which one becomes the pose.

@@ -168,24 +168,19 @@ def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tenso
     return detection.states(fitted.ratio, max(1, min(count, likely)))
 
 
-def detected_poses(view: View, count: int) -> Tensor:
-    """(1 + H, 27) a detection's poses: the likeliest one bent to the keypoints, and H <= `count`
-    hypotheses. (0, 27) of an empty detection; without refinement, only the H.
+def bent_pose(view: View) -> Tensor:
+    """(1, 27) a detection's likeliest pose, bent to the keypoints; (0, 27) of an empty detection.
 
     Keypoints are more exact than hypotheses where a finger is seen, but no pose by themselves.
     """
     if view.detection.empty:
         return torch.zeros(0, 27)
-    states, cfg = hypotheses_of(view.detection, view.fitted, count), view.model.refinement
-    if not cfg.iterations:
-        return states
-    bent = states[:1]
-    silhouette = bent.new_zeros(0, 0, dtype=torch.int32)
-    nothing = SeenPoints(bent.new_zeros(0, 3), silhouette, view.observation.k, (0, 0))
+    pose = view.detection.states(view.fitted.ratio, 1)
+    silhouette = pose.new_zeros(0, 0, dtype=torch.int32)
+    nothing = SeenPoints(pose.new_zeros(0, 3), silhouette, view.observation.k, (0, 0))
     keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
-    return torch.cat(
-        (view.fitted.refiner(bent, bent[:, 6:], nothing, _freely(cfg), keypoints), states)
-    )
+    freely = _freely(view.model.refinement)
+    return view.fitted.refiner(pose, pose[:, 6:], nothing, freely, keypoints)
 
 
 @lru_cache
@@ -200,8 +195,9 @@ def best_start(view: View) -> tuple[Tensor, float]:
     The detection must not be empty.
     """
     model = view.model
-    poses = detected_poses(view, model.detector.settings.hypotheses)
+    poses = hypotheses_of(view.detection, view.fitted, model.detector.settings.hypotheses)
     if model.refinement.iterations:
+        poses = torch.cat((bent_pose(view), poses))
         poses = torch.cat((poses, view.refine(poses)))
     values = view.log_posterior(poses)
     best = int(values.argmax())
@@ -224,7 +220,7 @@ class Hypotheses:
 
 def propose(view: View, mean: Tensor) -> Hypotheses:
     """Refined and scored hypotheses of a frame: the filter's `mean` (1, 27), its wrist with the
-    last frame's fingers, and the detector's likeliest pose, raw and bent.
+    last frame's fingers, and the detector's likeliest pose, bent to the keypoints.
 
     A covered hand has its last pose alone; without refinement there is `mean` alone. A pose that
     explains nothing once refined stays as proposed: the few points that are left of a hand that
@@ -234,7 +230,7 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
         return scored(view, mean)
     if view.covered:
         return scored(view, view.track.pose)
-    detected = detected_poses(view, 1)
+    detected = bent_pose(view)
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     poses = torch.cat((previous, mean, detected))
     table = scored(view, view.refine(poses), len(detected))
