@@ -142,6 +142,7 @@ def _own(depth, surfaces, reliable, nearest, owner):
     owner: (H, W) int8 of -1.
     """
     height, width = depth.shape
+    left, right, top, bottom = width, -1, height, -1
     for v in range(height):
         for u in range(width):
             nearest[v, u], least = -1, _TOLERANCE_M
@@ -149,8 +150,10 @@ def _own(depth, surfaces, reliable, nearest, owner):
                 there = surfaces[row, v, u] > 0 and depth[v, u] > 0
                 if there and abs(surfaces[row, v, u] - depth[v, u]) < least:
                     nearest[v, u], least = row, abs(surfaces[row, v, u] - depth[v, u])
-    for v in range(height):
-        for u in range(width):
+            if nearest[v, u] >= 0:
+                left, right, top, bottom = min(left, u), max(right, u), min(top, v), v
+    for v in range(max(top - 1, 0), min(bottom + 2, height)):
+        for u in range(max(left - 1, 0), min(right + 2, width)):
             if nearest[v, u] >= 0:
                 owner[v, u] = nearest[v, u] if reliable[nearest[v, u]] else -1
                 continue
