@@ -274,14 +274,11 @@ def without_things(observation: Observation, parts: Parts) -> Observation:
     """
     if observation.empty or np.count_nonzero(parts.kind == THING_PART) < _LEAST_PARTS:
         return observation
-    row, column = np.nonzero(observation.hand.numpy())
-    of = parts.at(_points_of(row, column, observation)) == THING_PART
-    if not of.any():
+    thing = _classes(observation, observation.hand, parts, _UNKNOWN) == THING_PART
+    if not thing.any():
         return observation
-    mask = np.zeros(observation.hand.shape, bool)
-    mask[row[of], column[of]] = True
-    thing = torch.from_numpy(mask)
-    return replace(observation, hand=observation.hand & ~thing, thing=thing)
+    of_thing = torch.from_numpy(thing)
+    return replace(observation, hand=observation.hand & ~of_thing, thing=of_thing)
 
 
 def with_own_arm(observation: Observation, detection: Detection) -> Observation:
@@ -292,11 +289,9 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     """
     occluder = observation.occluder.numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
-    row, column = np.nonzero(occluder)
-    kind = detection.parts.at(_points_of(row, column, observation), outside=_UNKNOWN)
-    of = surface[row, column]
-    known = np.bincount(of[kind != _UNKNOWN], minlength=count)
-    mine = np.bincount(of[kind == FOREARM_PART], minlength=count)
+    kind = _classes(observation, observation.occluder, detection.parts, _UNKNOWN)
+    known = np.bincount(surface[kind != _UNKNOWN], minlength=count)
+    mine = np.bincount(surface[kind == FOREARM_PART], minlength=count)
     of_arm = (mine > _MOSTLY * known)[surface] & occluder
     if not of_arm.any():
         return observation
@@ -304,14 +299,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 
-def _points_of(row: np.ndarray, column: np.ndarray, observation: Observation) -> np.ndarray:
-    return points_at(row, column, observation.depth_m.numpy(), observation.k.numpy())
-
-
-def points_at(
-    row: np.ndarray, column: np.ndarray, depth_m: np.ndarray, k: np.ndarray
-) -> np.ndarray:
-    """(P, 3) m, the points that an image (H, W) shows at pixels (P,), camera frame."""
-    z = depth_m[row, column]
-    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
-    return np.stack((x, y, z), 1)
+def _classes(observation: Observation, pixels: Tensor, parts: Parts, other: int) -> np.ndarray:
+    """(H, W) what the pose network calls an image's pixels; `other` where it does not look."""
+    depth_m, k = observation.depth_m.numpy(), observation.k.numpy()
+    return parts.seen(depth_m, pixels.numpy(), k, other)

@@ -14,7 +14,6 @@ from toftrack.compute.compiling import entry_point
 from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import cpu_surface, parted, range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
-from toftrack.tracking.candidates import points_at
 from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
@@ -118,7 +117,7 @@ class Scene:
     def near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
         """(P, 3) m, the image's points within radius_m along each axis of a point (3,)."""
         row, column = np.nonzero(np.abs(self.depth_m - centre_m[2]) < radius_m)
-        points = points_at(row, column, self.depth_m, self.k)
+        points = _points_at(row, column, self.depth_m, self.k)
         inside: np.ndarray = points[np.abs(points - centre_m).max(1) < radius_m]
         return inside
 
@@ -132,6 +131,15 @@ class Scene:
         return tuple(
             hand.joints_m for at, hand in enumerate(self.hands) if at != row and hand.track.reliable
         )
+
+
+def _points_at(
+    row: np.ndarray, column: np.ndarray, depth_m: np.ndarray, k: np.ndarray
+) -> np.ndarray:
+    """(P, 3) m, the points that an image (H, W) shows at pixels (P,), camera frame."""
+    z = depth_m[row, column]
+    x, y = (column - k[0, 2]) / k[0, 0] * z, (row - k[1, 2]) / k[1, 1] * z
+    return np.stack((x, y, z), 1)
 
 
 @entry_point
