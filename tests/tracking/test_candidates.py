@@ -23,6 +23,7 @@ from toftrack.tracking.candidates import (
     _MARGIN,
     Hypotheses,
     View,
+    as_last_seen,
     best_start,
     hypotheses_of,
     propose,
@@ -181,6 +182,19 @@ def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:
     before = fitted.scorer(poses, likelihood.evidence(whole))
     assert (counts.correct < before.correct).all() and (counts.missed <= before.missed).all()
     assert counts.missed[1] + counts.false[1] < before.missed[1] + before.false[1]
+
+
+def test_what_was_a_thing_at_the_last_look_is_left_out_until_the_next() -> None:
+    parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
+    parts[: PARTS // 2] = THING_PART
+    whole, rest, centre = seen_with(parts)
+    looked = Parts(parts, crop_rotation(centre), centre, False)
+    view = view_of(image_of(hand_at()), replace(track_of(hand_at()), parts=looked))
+    seen = as_last_seen(view).observation
+    assert rest.thing is not None and seen.thing is not None
+    assert torch.equal(seen.hand, rest.hand) and torch.equal(seen.thing, rest.thing)
+    plain = view_of(image_of(hand_at()), track_of(hand_at()))
+    assert as_last_seen(plain) is plain
 
 
 def test_without_a_thing_all_stays_as_it_is() -> None:

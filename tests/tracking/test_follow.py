@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import fields, replace
 from typing import Any
 
 import pytest
 import torch
-from helpers.detection import detection_of
+from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import (
     hand_at,
     image_of,
@@ -20,7 +21,9 @@ from helpers.rendered import (
 from helpers.settings import confidence_model
 
 from toftrack.compute.pace import FRAME_S, Duration, Spans
+from toftrack.detector.hand_detector import Detection
 from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.render.scoring import Counts
 from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
@@ -146,6 +149,36 @@ def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_witho
     assert reported.cloud.particles.std(0).any() and not estimate.lost
     assert bool(other.cloud.particles.std(0).any()) != sure
     torch.testing.assert_close(other.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
+
+
+class SlowDetector(FixedDetector):
+    """Waits are noted in `order`."""
+
+    def __init__(self, order: list[str]) -> None:
+        super().__init__()
+        self.order = order
+
+    def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
+        wait = super().start(depth_m, k, centre_m, side, up)
+        return lambda: (self.order.append("waited"), wait())[1]
+
+
+def test_particles_are_filtered_before_a_detection_is_waited_for() -> None:
+    order: list[str] = []
+    model = replace(right_hand_model(), detector=SlowDetector(order))
+    likelihood = type(model.likelihood)
+
+    class Noted(likelihood):
+        def log_score(self, counts: Counts, coverage: float | None = None) -> torch.Tensor:
+            order.append("scored")
+            return super().log_score(counts, coverage)
+
+    noted = Noted(
+        **{field.name: getattr(model.likelihood, field.name) for field in fields(model.likelihood)}
+    )
+    state = state_of(track_of(HERE))
+    step(state, replace(IMAGE, timestamp_s=FRAME_S), replace(model, likelihood=noted))
+    assert order.index("waited") == model.filter.passes
 
 
 # Which tracks go on.
