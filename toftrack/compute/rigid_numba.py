@@ -255,11 +255,16 @@ def joints_of(states, base_frames, base, lengths, mirror, joints, frames_out):
     """
     frames, posed, state = np.empty((16, 3, 3)), np.empty((21, 3)), np.empty(27)
     for i in range(len(states)):
-        state[:] = states[i]
+        for j in range(27):  # slices take numba long to compile
+            state[j] = states[i, j]
         pose_hand(state, base_frames, base, lengths, mirror, frames, posed)
-        joints[i] = posed
-        if i < len(frames_out):
-            frames_out[i] = frames
+        for j in range(21):
+            for k in range(3):
+                joints[i, j, k] = posed[j, k]
+        for j in range(16 if i < len(frames_out) else 0):
+            for k in range(3):
+                for column in range(3):
+                    frames_out[i, j, k, column] = frames[j, k, column]
 
 
 def compose(reference: Tensor, tangent: Tensor) -> Tensor:
