@@ -38,9 +38,12 @@ _EXCHANGES = _exchanges(_SIDE * _SIDE)
 
 @entry_point
 def _thinned(image, factor, offset, exchanges, out):
-    """See `thinned`. A row at a time, so that the exchanges are vectorised over its columns."""
+    """See `thinned`; image, out: of int32.
+
+    A row at a time, so that the exchanges are vectorised over its columns.
+    """
     columns, half = out.shape[1], _SIDE // 2
-    values = np.empty((_SIDE * _SIDE, columns), np.float32)
+    values = np.empty((_SIDE * _SIDE, columns), np.int32)
     where = np.empty((_SIDE, columns), np.uint64)
     for place in range(_SIDE):
         for column in range(columns):
@@ -57,8 +60,7 @@ def _thinned(image, factor, offset, exchanges, out):
             low, high = values[exchanges[pair, 0]], values[exchanges[pair, 1]]
             for column in range(columns):
                 a, b = low[column], high[column]
-                low[column] = a if a < b else b
-                high[column] = b if a < b else a
+                low[column], high[column] = min(a, b), max(a, b)
         for column in range(columns):
             out[row, column] = values[_SIDE * _SIDE // 2, column]
 
@@ -66,11 +68,13 @@ def _thinned(image, factor, offset, exchanges, out):
 def thinned(image: np.ndarray, factor: int, offset: int) -> np.ndarray:
     """Every `factor`-th pixel from `offset` on of an image filtered by the median of 5 x 5.
 
-    image: (H, W) float32 without NaN; at its edge, the last pixels are repeated. The same as
-    cv2.medianBlur(image, 5)[offset::factor, offset::factor], without the pixels between. On one
+    image: (H, W) float32, none negative or NaN; at its edge, the last pixels are repeated. The same
+    as cv2.medianBlur(image, 5)[offset::factor, offset::factor], without the pixels between. On one
     thread, for meanwhile the networks have the others.
     """
     rows, columns = (len(range(offset, size, factor)) for size in image.shape)
     out = np.empty((rows, columns), np.float32)
-    _thinned(image, factor, offset, _EXCHANGES, out)
+    # As whole numbers they are in the same order, and exchanged six times as fast by AVX2, which
+    # has a smaller one of two floats only with a branch or a slow store.
+    _thinned(image.view(np.int32), factor, offset, _EXCHANGES, out.view(np.int32))
     return out
