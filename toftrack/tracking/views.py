@@ -11,7 +11,6 @@ from toftrack.compute.pace import Duration
 from toftrack.detector.hand_detector import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.refinement import shape_fit
-from toftrack.refinement.seen_points import seen_points
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.association import SideDetection
@@ -28,10 +27,7 @@ _SPARE = 1
 
 def predicted_view(scene: Scene, row: int) -> View | None:
     """The view of a track where it is predicted, without detection; None where no hand can be."""
-    view = make_view(scene, row, _later(scene, row), NO_DETECTION, scene.hands[row].depths)
-    if view is not None:
-        seen_points(view.observation)  # kept: there is time for it while the networks look
-    return view
+    return make_view(scene, row, _later(scene, row), NO_DETECTION, scene.hands[row].depths)
 
 
 def _later(scene: Scene, row: int) -> Track:
