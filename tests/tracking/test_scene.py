@@ -84,11 +84,11 @@ def test_the_mixed_pixels_of_an_outline_are_the_hand_s_as_well() -> None:
 
 def test_in_what_is_unexplained_there_is_no_hand_of_a_track() -> None:
     scene = scene_of(track_of(LEFT), image=BOTH)
-    rest = scene.unexplained().depth_m
+    rest = scene.unexplained.depth_m
     assert (rest[visible(LEFT)] > 2.0).mean() > 0.99
     np.testing.assert_array_equal(rest[visible(RIGHT)], BOTH.depth_m[visible(RIGHT)])
     assert BOTH.depth_m[visible(LEFT)].max() < 1.0, "the image itself is left alone"
-    assert scene_of(image=BOTH).unexplained() is BOTH
+    assert scene_of(image=BOTH).unexplained is BOTH
 
 
 def test_the_networks_see_a_hand_without_the_other_one_but_with_what_hides_it() -> None:
@@ -108,7 +108,7 @@ def test_an_image_that_is_larger_than_hands_are_segmented_in_is_cut_out_whole() 
     k[:2, 2] += 1.5
     scene = scene_of(track_of(LEFT), image=DepthImage(depth, k, 0, 0.0))
     assert scene.depth_m.size < depth.size
-    rest = scene.unexplained().depth_m
+    rest = scene.unexplained.depth_m
     assert rest.shape == depth.shape
     large = np.repeat(np.repeat(visible(LEFT), 4, 0), 4, 1)
     assert (rest[large] > 2.0).mean() > 0.95

@@ -23,7 +23,7 @@ from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
-from toftrack.hand.surface import hand_surface
+from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.refinement.gauss_newton import (
     ALONG_BONE,
     FACING_M,
@@ -430,6 +430,26 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
             _move(state, priors[i], settings, sums)
 
 
+@entry_point
+def pose_surface(state, shape, surface, centres_out, axes_out):
+    """The ellipsoids of a hand (27,), see HandSurface.pose; shape, surface: see refine_hands.
+
+    centres_out: (E, 3), axes_out: (E, 3, 3), written.
+    """
+    index, centres, axes = surface
+    frames, joints = empty((16, 3, 3), np.float64), empty((21, 3), np.float64)
+    pose_hand(state, *shape, frames, joints)
+    for e in range(len(index)):
+        frame, origin = frames[index[e]], _origin(joints, index[e])
+        for i in range(3):
+            centres_out[e, i] = joints[origin, i]
+            for j in range(3):
+                centres_out[e, i] += frame[i, j] * centres[e, j]
+                axes_out[e, i, j] = 0
+                for k in range(3):
+                    axes_out[e, i, j] += frame[i, k] * axes[e, k, j]
+
+
 class Refiner:
     """Brings hands of one shape onto what is seen, on the CPU."""
 
@@ -460,6 +480,13 @@ class Refiner:
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
         joints_of(states_read, *self._shape, joints.numpy(), frames.numpy())
         return HandPose(joints, frames, joints[:, _ORIGINS])
+
+    def surface(self, state: Tensor) -> Ellipsoids:
+        """(1, E) the ellipsoids of a hand (1, 27), without the wrist's; camera frame."""
+        count = len(self._surface[0])
+        posed = np.empty((1, count, 3), np.float32), np.empty((1, count, 3, 3), np.float32)
+        pose_surface(_array(state[0]), self._shape, self._surface, posed[0][0], posed[1][0])
+        return Ellipsoids(*map(torch.from_numpy, posed))
 
     def __call__(
         self,

@@ -37,11 +37,12 @@ class Likelihood:
 
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
-        seen, nothing = observation, torch.zeros(0, 0, dtype=torch.bool)
-        given = seen.hand, seen.occluder, seen.other, seen.thing
-        masks = [(nothing if mask is None else mask).cpu().numpy() for mask in given]
+        seen = observation
+        given = [mask.cpu().numpy() for mask in (seen.hand, seen.occluder)]
+        for mask in (seen.other, seen.thing):
+            given.append(np.zeros_like(given[0]) if mask is None else mask.cpu().numpy())
         images = np.empty((3, *seen.depth_m.shape), np.float32)
-        _band(seen.depth_m.cpu().numpy(), *masks, np.float32(self.tolerance_m), images)
+        _band(seen.depth_m.cpu().numpy(), *given, np.float32(self.tolerance_m), images)
         lowest, highest, hidden = torch.from_numpy(images).to(seen.depth_m.device)
         distance_m = 1.0 if observation.empty else observation.nearest_m
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
@@ -67,22 +68,20 @@ class Likelihood:
 
 @entry_point
 def _band(depth, hand, occluder, other, thing, tolerance, images):
-    """low, high and occluder of an Evidence, into images (3, H, W); other, thing: may be (0, 0).
+    """low, high and occluder of an Evidence, into images (3, H, W).
 
-    A model surface at an occluder is hidden, not false; at another hand only behind it.
+    A model surface at an occluder is hidden, not false; at another hand only behind it. Without
+    branches, so that pixels are computed side by side.
     """
-    inverse, never = np.float32(1), np.float32(np.inf)
+    inverse, nothing, never = np.float32(1), np.float32(0), np.float32(np.inf)
+    lowest, highest, hidden = images[0], images[1], images[2]
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
-            z, low, high, hidden = depth[v, u], never, -never, np.float32(0)
-            if hand[v, u]:
-                low = inverse / (z + tolerance)
-                high = inverse / max(z - tolerance, _LEAST_M)
-            if len(other) and other[v, u] and z > 0:
-                hidden = inverse / z
-            if occluder[v, u] or (len(thing) and thing[v, u]):
-                hidden = never
-            images[0, v, u], images[1, v, u], images[2, v, u] = low, high, hidden
+            z, seen = depth[v, u], hand[v, u]
+            low, high = inverse / (z + tolerance), inverse / max(z - tolerance, _LEAST_M)
+            lowest[v, u], highest[v, u] = low if seen else never, high if seen else -never
+            behind = inverse / z if other[v, u] & (z > 0) else nothing
+            hidden[v, u] = never if occluder[v, u] | thing[v, u] else behind
 
 
 @dataclass(frozen=True)

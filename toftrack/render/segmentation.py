@@ -12,11 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.errors import check_number
 from toftrack.render.numba.median import thinned
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
+_SPECKS = 8
+"""So many times the nearest pixel is looked for, which takes a twentieth of sorting them all."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,21 +110,19 @@ class NearestSurface:
         other: (H, W) bool of the reduced image, pixels of another hand.
         """
         depth_m, k = reduce_image(depth_m, k, self.max_pixels)
-        valid = (depth_m > 0) & (depth_m <= self.max_distance_m)
-        if other is not None:
-            valid &= ~other
+        shape, focal_area = depth_m.shape, float(k[0, 0] * k[1, 1])
+        valid, occluder = np.empty(shape, np.bool_), np.zeros(shape, np.bool_)
+        around = np.ones(shape, np.uint8)
+        nobody, depths, pixel_m2 = np.zeros(shape, np.bool_), (0.0, 0.0), 0.0
         if expected is not None and expected.centre_m is not None and self.reach_m < math.inf:
-            valid &= _disc(valid.shape, k, expected.centre_m, self.reach_m)
-        occluder = np.zeros_like(valid)
+            around = _disc(shape, k, expected.centre_m, self.reach_m)
         if expected is not None and self.occluder_margin_m > 0:
-            in_front = valid & (depth_m < expected.nearest_m - self.occluder_margin_m)
-            at_hand = valid & ~in_front & (depth_m < expected.farthest_m + self.occluder_margin_m)
-            seen_m2 = np.count_nonzero(at_hand) * expected.nearest_m**2 / float(k[0, 0] * k[1, 1])
-            if seen_m2 > self.min_area_m2:
-                # Pixels on its edge mix it with what is behind, and are neither.
-                grown = cv2.dilate(in_front.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-                occluder, valid = grown, valid & ~grown
-        nearest = self._nearest(depth_m, valid, float(k[0, 0] * k[1, 1]))
+            margin_m, pixel_m2 = self.occluder_margin_m, expected.nearest_m**2 / focal_area
+            depths = expected.nearest_m - margin_m, expected.farthest_m + margin_m
+        masks = around, nobody if other is None else other
+        limits = tuple(map(np.float32, (self.max_distance_m, *depths)))
+        _part(depth_m, *masks, limits, (pixel_m2, float(self.min_area_m2)), valid, occluder)
+        nearest = self._nearest(depth_m, valid, focal_area)
         farthest = nearest + self.depth_range_m
         if expected is not None and self.occluder_margin_m > 0:
             # What is well behind a tracked hand is the body, not a part of the hand it misses.
@@ -142,7 +143,7 @@ class NearestSurface:
         inside = dropped[1:-1, 1:-1]
         inside[:] = ~valid
         flags = 4 | cv2.FLOODFILL_FIXED_RANGE | cv2.FLOODFILL_MASK_ONLY | (1 << 8)
-        for row, column in _nearest_first(depth_m, valid):
+        for row, column in _nearest_first(depth_m, inside):
             if inside[row, column]:
                 continue
             nearest = float(depth_m[row, column])
@@ -160,7 +161,7 @@ class NearestSurface:
 def _disc(
     shape: tuple[int, ...], k: np.ndarray, centre_m: tuple[float, float, float], radius_m: float
 ) -> np.ndarray:
-    """(H, W) bool: the pixels within `radius_m` of a point, seen at its distance."""
+    """(H, W) uint8: 1 for the pixels within `radius_m` of a point, seen at its distance."""
     x, y, z = centre_m
     z = max(z, _NEAREST_M)  # what is expected of a track may even lie behind the camera
     u, v = k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]
@@ -168,16 +169,53 @@ def _disc(
     limit = 4 * max(shape)
     at = (round(min(max(u, -limit), limit)), round(min(max(v, -limit), limit)))
     cv2.circle(disc, at, min(round(radius_m * k[0, 0] / z), limit), 1, -1)
-    return disc > 0
+    return disc
 
 
-def _nearest_first(depth_m: np.ndarray, valid: np.ndarray) -> Iterator[tuple[int, int]]:
-    """Row and column of the valid pixels; they are only sorted if the first one does not do."""
-    if not valid.any():
+@entry_point
+def _part(depth, around, other, limits, areas, valid, occluder):
+    """The pixels that may be of a hand, and those that hide it; all (H, W), the last two written.
+
+    around: not 0 where the hand may be.  other: another hand's.  occluder: of False.
+    limits: the farthest depth; those from which on, and up to which, an expected hand is.
+    areas: m2 of a pixel at its depth, 0 = no hand is expected; and what of it must be seen before
+        anything hides it.
+    """
+    most, front, back = limits
+    height, width = depth.shape
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            z = depth[v, u]
+            valid[v, u] = (z > 0) & (z <= most) & (around[v, u] > 0) & (not other[v, u])
+            count += valid[v, u] & (z >= front) & (z < back)
+    if not count * areas[0] > areas[1]:
         return
-    column, row = cv2.minMaxLoc(depth_m, valid.view(np.uint8))[2]
-    yield row, column
-    rows, columns = np.nonzero(valid)
+    # Pixels on an occluder's edge mix it with what is behind, and are neither.
+    for v in range(height):
+        for u in range(width):
+            if valid[v, u] and depth[v, u] < front:
+                for row in range(max(v - 1, 0), min(v + 2, height)):
+                    for column in range(max(u - 1, 0), min(u + 2, width)):
+                        occluder[row, column] = True
+    for v in range(height):
+        for u in range(width):
+            valid[v, u] &= not occluder[v, u]
+
+
+def _nearest_first(depth_m: np.ndarray, dropped: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Row and column of the nearest pixel that is not dropped, again and again: some are dropped
+    meanwhile. When that took long, all others are sorted.
+
+    dropped: (H, W) uint8.
+    """
+    for _ in range(_SPECKS):
+        left = dropped == 0
+        if not left.any():
+            return
+        column, row = cv2.minMaxLoc(depth_m, left.view(np.uint8))[2]
+        yield row, column
+    rows, columns = np.nonzero(dropped == 0)
     order = np.argsort(depth_m[rows, columns], kind="stable")
     yield from zip(rows[order].tolist(), columns[order].tolist(), strict=True)
 

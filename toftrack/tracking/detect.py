@@ -54,7 +54,7 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     """The networks that are due in a frame, started: they work beside whatever comes next."""
     detector = scene.model.detector
     several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
-    image = scene.unexplained() if several else scene.image
+    image = scene.unexplained if several else scene.image
     followed = bool(scene.hands) and all(hand.track.reliable for hand in scene.hands)
     urgent = not followed or scene.dt_s > _RARE_S
     frames = detector.settings.search * (1 if urgent else _FOLLOWED)
@@ -85,11 +85,9 @@ def finish_detection(
     rare = scene.dt_s > _RARE_S
     known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
     places = _apart_from(known, places)
-    if len(places.centre_m):
-        arms = [] if rare else _arms(scene, seen)
-        found = _elsewhere(scene, state, places, rare)
-        seen += [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
-    return seen
+    found = _elsewhere(scene, state, places, rare) if len(places.centre_m) else []
+    arms = _arms(scene, seen) if found and not rare else []
+    return seen + [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
 
 
 def rests(scene: Scene, row: int, state: TrackerState) -> bool:
@@ -132,7 +130,6 @@ def _elsewhere(
     scene: Scene, state: TrackerState, places: Places, rare: bool
 ) -> list[SideDetection]:
     """Detections at the finder's places as hands of each missing side, by merit or as held out."""
-    image = scene.image if rare else scene.unexplained()
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
     confirmed = [track for track in tracks if track.confirmed]
@@ -151,6 +148,7 @@ def _elsewhere(
         known = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
         there = _apart_from(known, places)
         if len(there.centre_m):
+            image = scene.image if rare else scene.unexplained
             found = scene.model.detector.look(image.depth_m, image.k, there, side)
             seen += [SideDetection(one, side) for one in found]
     seen.sort(key=lambda one: -one.detection.merit)

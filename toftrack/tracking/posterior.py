@@ -15,6 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
+from toftrack.compute.rigid_numba import distance
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import check_number
 from toftrack.refinement.gauss_newton import Keypoints
@@ -87,5 +89,19 @@ def keypoints_off(joints_m: Tensor, keypoints: Keypoints) -> Tensor:
 
 def touching(joints_m: Tensor, other_m: Tensor) -> Tensor:
     """(N,) how much of hands (N, 21, 3) lies in another one (J, 3), 0 .. 1."""
-    near = torch.cdist(joints_m, other_m.to(joints_m)[None].expand(len(joints_m), -1, -1))
-    return (1 - near.amin(2) / _TOUCH_M).clamp(min=0).mean(1)
+    found = np.empty(len(joints_m), np.float32)
+    _touch(joints_m.numpy(), other_m.numpy(), found)
+    return torch.from_numpy(found)
+
+
+@entry_point
+def _touch(joints, other, found):
+    """See touching."""
+    for n in range(len(joints)):
+        total = 0.0
+        for j in range(joints.shape[1]):
+            nearest = _TOUCH_M
+            for i in range(len(other)):
+                nearest = min(nearest, distance(joints[n, j], other[i]))
+            total += 1 - nearest / _TOUCH_M
+        found[n] = total / joints.shape[1]

@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
-import cv2
 import numpy as np
 import torch
 
 from toftrack.compute.compiling import entry_point
 from toftrack.frames.frame import DepthImage
-from toftrack.render.model_image import cpu_surface, parted, range_image
+from toftrack.render.model_image import range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
 from toftrack.tracking.filter import PredictedHand, predict
 from toftrack.tracking.model import TrackerModel
@@ -67,8 +66,7 @@ class Scene:
         size = self.depth_m.shape
 
         def drawn(hand: PredictedHand) -> np.ndarray:
-            surface = cpu_surface(hand.fitted.shape).pose(hand.fitted.refiner.pose(hand.pose))
-            return range_image(parted(surface)[0], self.k, *size)
+            return range_image(hand.fitted.refiner.surface(hand.pose), self.k, *size)
 
         return np.array([drawn(hand) for hand in self.hands], np.float32).reshape(-1, *size)
 
@@ -95,23 +93,21 @@ class Scene:
         A new hand's, row -1: without all of them.
         """
         if row < 0:
-            return self.unexplained()
+            return self.unexplained
         others = self.owned_by_others(row)
         if others is None:
             return self.image
         nearest = float(self.hands[row].pose[0, 2]) - _IN_FRONT_M
         return self._without(others & (self.depth_m > nearest))
 
+    @cached_property
     def unexplained(self) -> DepthImage:
         """The image without the pixels that hands own."""
         return self._without(self.owners >= 0) if self.hands else self.image
 
     def _without(self, pixels: np.ndarray) -> DepthImage:
-        if not pixels.any():
-            return self.image
-        height, width = self.image.depth_m.shape
-        gone = cv2.resize(pixels.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
-        depth_m = np.where(gone, np.float32(_FAR_M), self.image.depth_m)
+        depth_m = np.empty_like(self.image.depth_m)
+        _remove(self.image.depth_m, pixels, np.float32(_FAR_M), depth_m)
         return replace(self.image, depth_m=depth_m)
 
     def near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
@@ -143,6 +139,17 @@ def _points_at(
 
 
 @entry_point
+def _remove(depth, pixels, far, left):
+    """What is left, (H, W), of an image without pixels (h, w) of the reduced one: they are far."""
+    height, width = depth.shape
+    down, across = pixels.shape[0] / height, pixels.shape[1] / width
+    for v in range(height):
+        row = int((v + 0.5) * down)
+        for u in range(width):
+            left[v, u] = far if pixels[row, int((u + 0.5) * across)] else depth[v, u]
+
+
+@entry_point
 def _own(depth, surfaces, reliable, nearest, owner):
     """See Scene.owners; surfaces: (B, H, W), reliable: (B,) bool.
 
@@ -155,22 +162,27 @@ def _own(depth, surfaces, reliable, nearest, owner):
         for u in range(width):
             nearest[v, u], least = -1, _TOLERANCE_M
             for row in range(len(surfaces)):
-                there = surfaces[row, v, u] > 0 and depth[v, u] > 0
-                if there and abs(surfaces[row, v, u] - depth[v, u]) < least:
-                    nearest[v, u], least = row, abs(surfaces[row, v, u] - depth[v, u])
+                if surfaces[row, v, u] > 0 and depth[v, u] > 0:
+                    away = abs(surfaces[row, v, u] - depth[v, u])
+                    if away < least:
+                        nearest[v, u], least = row, away
             if nearest[v, u] >= 0:
                 left, right, top, bottom = min(left, u), max(right, u), min(top, v), v
+    around = np.empty(len(surfaces), np.float32)
     for v in range(max(top - 1, 0), min(bottom + 2, height)):
         for u in range(max(left - 1, 0), min(right + 2, width)):
             if nearest[v, u] >= 0:
                 owner[v, u] = nearest[v, u] if reliable[nearest[v, u]] else -1
+            if nearest[v, u] >= 0 or depth[v, u] <= 0:
                 continue
             for row in range(len(surfaces)):
-                around = np.float32(0)
-                for y in range(max(v - 1, 0), min(v + 2, height)):
-                    for x in range(max(u - 1, 0), min(u + 2, width)):
-                        if nearest[y, x] == row:
-                            around = max(around, surfaces[row, y, x])
-                mixed = around > 0 and around < depth[v, u] < around + _EDGE_M
+                around[row] = 0
+            for y in range(max(v - 1, 0), min(v + 2, height)):
+                for x in range(max(u - 1, 0), min(u + 2, width)):
+                    row = nearest[y, x]
+                    if row >= 0:
+                        around[row] = max(around[row], surfaces[row, y, x])
+            for row in range(len(surfaces)):
+                mixed = around[row] > 0 and around[row] < depth[v, u] < around[row] + _EDGE_M
                 if mixed and reliable[row]:
                     owner[v, u] = row

@@ -73,7 +73,7 @@ def max_new_tracks(state: TrackerState) -> int:
 
 def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerState) -> View | None:
     """The view of a new tentative track of a number; None where no hand can be."""
-    model, detection, image = scene.model, one.detection, scene.unexplained()
+    model, detection, image = scene.model, one.detection, scene.unexplained
     nothing, shape = torch.zeros(1, 6 + model.space.dims), known_shape(one.side, state)
     cloud, pose = ParticleSet(nothing, nothing[:, 0], nothing), torch.zeros(1, 27)
     track = Track(cloud, nothing[0], pose, number=number, side=one.side, shape=shape)

@@ -321,24 +321,25 @@ def pack_evidence(low, high, occluder, hand):
     pitch = blocks(width)
     images = _zeros(height * pitch * _IMAGES * BLOCK)
     bits = np.zeros((((width + 63) >> 6) + 1, height + WORDS), np.uint64)
+    half, part, never = np.float32(0.5), np.float32(1e-6), np.float32(np.inf)
     for v in range(height):
         for block in range(pitch):
-            at = (v * pitch + block) * _IMAGES * BLOCK
-            for j in range(BLOCK):
-                u = block * BLOCK + j
-                middle, scale, hidden = _ZERO, np.float32(np.inf), np.float32(np.inf)
-                if u < width:
-                    hidden = max(occluder[v, u], _FAR)
-                    if high[v, u] > low[v, u]:
-                        # What is not drawn is 0, and must not be correct.
-                        least = max(low[v, u], np.float32(1e-6) * high[v, u])
-                        middle = np.float32(0.5) * (high[v, u] + least)
-                        scale = _TWO / (high[v, u] - least)
-                images[at + j] = middle
-                images[at + BLOCK + j] = scale
-                images[at + 2 * BLOCK + j] = hidden
-        for u in range(width):
-            bits[u >> 6, v] |= np.uint64(hand[v, u]) << np.uint64(u & 63)
+            at, first = (v * pitch + block) * _IMAGES * BLOCK, block * BLOCK
+            count = max(min(BLOCK, width - first), 0)  # the last block may lie outside
+            for j in range(count):
+                lowest, highest = low[v, first + j], high[v, first + j]
+                # What is not drawn is 0, and must not be correct.
+                least, banded = max(lowest, part * highest), highest > lowest
+                images[at + j] = half * (highest + least) if banded else _ZERO
+                images[at + BLOCK + j] = _TWO / (highest - least) if banded else never
+                images[at + 2 * BLOCK + j] = max(occluder[v, first + j], _FAR)
+            for j in range(count, BLOCK):
+                images[at + BLOCK + j] = images[at + 2 * BLOCK + j] = never
+        for word in range((width + 63) >> 6):
+            found = np.uint64(0)
+            for u in range(min(64, width - 64 * word)):
+                found |= np.uint64(hand[v, 64 * word + u]) << np.uint64(u)
+            bits[word, v] = found
     return images, bits
 
 
