@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
+from toftrack.compute.compiling import entry_point
 from toftrack.detector.hand_detector import Detection, merit
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.filter import PredictedHand, palm_of
@@ -91,30 +92,50 @@ def least_cost(cost: np.ndarray) -> list[int]:
     The Hungarian method (Kuhn, Naval Res. Logist. Q. 2, 1955): row by row, along the shortest path
     of exchanges, by costs that are reduced by what rows and columns are worth.
     """
+    found = np.empty(len(cost), np.int64)
+    _assign_rows(cost, found)
+    at: list[int] = found.tolist()
+    return at
+
+
+@entry_point
+def _assign_rows(cost, found):
+    """See least_cost; found: (B,), written."""
     rows, columns = cost.shape
-    if rows == 1:
-        return [int(cost[0].argmin())]
     row_worth, column_worth = np.zeros(rows), np.zeros(columns + 1)
-    row_of = np.full(columns + 1, -1)  # the last column stands for that of the row to be placed
+    away, before = np.empty(columns), np.empty(columns, np.int64)
+    done, row_of = np.empty(columns + 1, np.bool_), np.empty(columns + 1, np.int64)
+    for column in range(columns + 1):
+        row_of[column] = -1
     for row in range(rows):
-        column, row_of[-1] = columns, row
-        away, before = np.full(columns, np.inf), np.full(columns, -1)
-        done = np.zeros(columns + 1, bool)
+        column, row_of[columns] = columns, row  # the last column stands for that of this row
+        for other in range(columns + 1):
+            done[other] = False
+        for other in range(columns):
+            away[other], before[other] = np.inf, -1
         while row_of[column] >= 0:
             done[column] = True
-            at = row_of[column]
-            reduced = cost[at] - row_worth[at] - column_worth[:-1]
-            nearer = ~done[:-1] & (reduced < away)
-            away[nearer], before[nearer] = reduced[nearer], column
-            nearest = int(np.where(done[:-1], np.inf, away).argmin())
-            step = away[nearest]
-            row_worth[row_of[done]] += step
-            column_worth[done] -= step
-            away[~done[:-1]] -= step
+            at, nearest, step = row_of[column], -1, np.inf
+            for other in range(columns):
+                if done[other]:
+                    continue
+                reduced = cost[at, other] - row_worth[at] - column_worth[other]
+                if reduced < away[other]:
+                    away[other], before[other] = reduced, column
+                if away[other] < step:
+                    nearest, step = other, away[other]
+            for other in range(columns + 1):
+                if done[other]:
+                    row_worth[row_of[other]] += step
+                    column_worth[other] -= step
+                elif other < columns:
+                    away[other] -= step
             column = nearest
         while column != columns:
             row_of[column], column = row_of[before[column]], before[column]
-    return [int(np.flatnonzero(row_of[:-1] == row)[0]) for row in range(rows)]
+    for column in range(columns):
+        if row_of[column] >= 0:
+            found[row_of[column]] = column
 
 
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:

@@ -26,6 +26,9 @@ _ARM_M, _ARM_RADIUS_M = 0.3, 0.06
 _FOLLOWED = 2
 """While every track is reliable the finder, which takes a fifth of a frame's time, is asked so much
 more rarely."""
+_UNSHOWN = 3
+"""A hand that no slot shows is looked at in every so manieth frame: all that it is followed for is
+to know it from the hand that is shown."""
 _AS_WELL, _WELL_M = 1.3, 0.02
 """Hands are seen about as well as the best one when their expected errors are less than so many
 times its error, or than this."""
@@ -91,11 +94,12 @@ def finish_detection(
 
 
 def rests(scene: Scene, row: int, state: TrackerState) -> bool:
-    """Whether a track is only moved on in this frame: a sure one, which no slot shows, in every
-    second frame, which saves a quarter of the time of two hands of which one is reported.
+    """Whether a track is only moved on in this frame: a sure one, which no slot shows, but in every
+    third frame.
     """
     track = scene.hands[row].track
-    return not state.shows(track) and track.asked_s == 0 and _is_sure(scene, row)
+    waited = Duration(track.asked_s + scene.dt_s).reached(_UNSHOWN)
+    return not state.shows(track) and not waited and _is_sure(scene, row)
 
 
 def _is_sure(scene: Scene, row: int) -> bool:

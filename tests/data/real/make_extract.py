@@ -3,9 +3,7 @@
 
     python tests/data/real/make_extract.py RECORDING GIT_DIR OUT.npz
 
-RECORDING: adi_tof, camcube_counts, camcube_group1, camcube_group3, cvar_p1, cvar_p3, cvar_p4,
-cvar_p5, cvar_p6, cvar_p7, fpha, hamer_depth, kinect1_room, r200_ceiling, room_desk, room_floor,
-room_phone, room_table or room_workshop. Needs git, numpy and opencv, r200_ceiling also scipy.
+RECORDING: one of README.md. Needs git, numpy and opencv, r200_ceiling also scipy.
 """
 
 import io
@@ -168,24 +166,73 @@ def r200_ceiling():
     save(depth, intrinsics(615.0, 615.0, 319.5, 239.5), joints_uv=joints, labels=labels)
 
 
-def room(folder, K, fps):
-    """Depth images without any hand: 16 bit, millimetres, FOLDER/NUMBER.png."""
-    command = ["git", "-C", git_dir, "ls-tree", "-r", "--name-only", "HEAD", f"{folder}/"]
-    names = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split()
-    paths = sorted((n for n in names if n.endswith(".png")), key=lambda n: (len(n), n))
-    depth = np.stack([image.astype(np.float32) / 1000 for image in images(*paths)])
+def room(pattern, K, fps=1.0, commit="HEAD"):
+    """Depth images without any hand, 16 bit, millimetres, 65535 = no reading, in the order of the
+    numbers in their names. pattern: of their paths.
+    """
+    command = ["git", "-C", git_dir, "ls-tree", "-r", "--name-only", commit]
+    names = subprocess.run(command, capture_output=True, check=True, text=True).stdout.split("\n")
+    paths = sorted(
+        (name for name in names if re.fullmatch(pattern, name)),
+        key=lambda name: [*map(int, re.findall(r"\d+", name))],
+    )
+    depth = np.stack([image.astype(np.float32) for image in images(*paths, commit=commit)]) / 1000
     depth[depth > 10] = 0
     save(depth, K, fps)
 
 
 ROOMS = {
-    "desk": ("data/depth", intrinsics(425.0, 425.0, 424.0, 240.0), 1.0),
-    "floor": ("depth", intrinsics(385.0, 385.0, 319.5, 239.5), 1.0),
-    # K is that of the repository; none of the others is told: what such cameras usually have.
-    "table": ("data/depth", intrinsics(616.7, 616.9, 324.8, 238.0), 1.0),
-    "workshop": ("data/depth", intrinsics(385.0, 385.0, 319.5, 239.5), 30.0),
-    "phone": ("depth", intrinsics(213.0, 213.0, 96.0, 128.0), 1.0),
+    "arm": (r"(images|validation)/depth_\d+\.png", intrinsics(612.0, 612.0, 328.5, 247.2)),
+    "bin": (
+        r"old-version/data/sample/.*depth\.png",
+        intrinsics(615.2, 615.2, 298.4, 247.5),
+        30.0,
+    ),
+    "board": (
+        # Not those in which somebody passes.
+        r"data/iros_data(/depth_frame00(01|02|04|05|07|08|09|14|16|17|22)"
+        r"|2/depth_frame00(02|08|09|11|14|16|17|22))\.png",
+        intrinsics(529.3, 531.3, 467.0, 273.3),
+    ),
+    "boxes": (r"data/(depth/\d+|test_img_depth)\.png", intrinsics(617.2, 617.5, 317.4, 246.0)),
+    "desk": (r"data/depth/.*\.png", intrinsics(425.0, 425.0, 424.0, 240.0)),
+    "floor": (r"depth/.*\.png", intrinsics(385.0, 385.0, 319.5, 239.5)),
+    "home": (
+        r"data/(kitchen/depth_[0-4]|depth_[45])\.png",  # in the others are persons
+        intrinsics(600.0, 600.0, 424.0, 240.0),
+        1.0,
+        "17037da5",
+    ),
+    "kitchen": (
+        r"data/frame-000(3\d\d|40\d|41\d|69\d|7\d\d|80\d)\.depth\.png",
+        intrinsics(585.0, 585.0, 320.0, 240.0),
+        30.0,
+    ),
+    "lamp": (
+        # What is between these may show a hand.
+        r"dataset/realsense/depth/0*(1[6-9]\d|2[0-2]\d|23[0-8]|3[1-5]\d|360|4[1-4]\d|45[0-5])\.png",
+        intrinsics(610.4, 609.8, 312.0, 246.1),
+        30.0,
+    ),
+    "marker": (r"depth/\d+\.png", intrinsics(920.0, 920.0, 640.0, 360.0)),
+    "mug": (
+        r"data/0000(0[0-69]|1\d|2[0-3])_depth\.png",  # 7 and 8 show a person
+        intrinsics(571.6, 571.5, 316.0, 243.7),
+    ),
+    "office": (r"depths/.*\.png", intrinsics(615.0, 615.0, 320.0, 240.0), 30.0),
+    "phone": (r"depth/.*\.png", intrinsics(213.0, 213.0, 96.0, 128.0)),
+    "plane": (
+        r"dataset/realsense/depth/.*\.png",
+        intrinsics(615.2, 615.5, 321.2, 244.2),
+        30.0,
+        "f374c160",
+    ),
+    "router": (r"data/depth_\d+\.png", intrinsics(425.8, 425.3, 425.9, 244.5)),
+    "table": (r"data/depth/.*\.png", intrinsics(616.7, 616.9, 324.8, 238.0)),
+    "workshop": (r"data/depth/.*\.png", intrinsics(385.0, 385.0, 319.5, 239.5), 30.0),
 }
+"""K is the repository's, as far as there is one; else (desk, floor, marker, office, phone, workshop)
+what such cameras usually have."""
 CAMCUBE = {
     "counts": ("data", "palm fist thumb_up victory three four palm"),
     "group1": (
@@ -207,5 +254,5 @@ MAKERS |= {
 MAKERS |= {f"room_{name}": lambda given=given: room(*given) for name, given in ROOMS.items()}
 
 if recording not in MAKERS:
-    raise SystemExit(__doc__)
+    raise SystemExit(f"{__doc__}\nRECORDING is one of {', '.join(sorted(MAKERS))}")
 MAKERS[recording]()
