@@ -21,6 +21,7 @@ import numpy as np
 import torch
 
 from toftrack.api import make_hands_tracker
+from toftrack.detector.flying_pixels import without_flying_pixels
 
 _JUMP_M = 0.03
 """Neighbouring readings that differ by more are an edge."""
@@ -296,7 +297,7 @@ def keypoints(
         for name, (change, *numbers) in PROPERTIES.items() if seen[n] > 0.7 else ():
             f = Frame(depth[n].astype(np.float32), k, joints[n], np.random.default_rng(n))
             change(f, *numbers)
-            image = np.ascontiguousarray(f.depth_m, np.float32)
+            image = without_flying_pixels(f.depth_m, f.k, detector.settings.flying)
             up = f.joints_m[9] - f.joints_m[0]
             (first,) = detector.detect(image, f.k, f.palm_m[None], side, up[None])
             centre = first.centre_m.numpy()[None]

@@ -51,6 +51,7 @@ class DetectorSettings:
     every: int
     search: int
     sure: float
+    flying: float
     keypoint_m: float
     keypoint_weight: float
 
@@ -60,6 +61,7 @@ class DetectorSettings:
         check_number("detector.sure", self.sure, 0.5, 0.999)
         check_number("detector.least", self.least, 0, 1)
         check_number("detector.merit", self.merit)
+        check_number("detector.flying", self.flying, 0)
         check_number("detector.keypoint_weight", self.keypoint_weight, 0)
         check_number("detector.keypoint_m", self.keypoint_m, 0, above=True)
 

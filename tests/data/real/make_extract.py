@@ -231,8 +231,8 @@ ROOMS = {
     "table": (r"data/depth/.*\.png", intrinsics(616.7, 616.9, 324.8, 238.0)),
     "workshop": (r"data/depth/.*\.png", intrinsics(385.0, 385.0, 319.5, 239.5), 30.0),
 }
-"""K is the repository's, as far as there is one; else (desk, floor, marker, office, phone, workshop)
-what such cameras usually have."""
+"""K is the repository's, as far as there is one; else (desk, floor, marker, office, phone, and
+workshop) what such cameras usually have."""
 CAMCUBE = {
     "counts": ("data", "palm fist thumb_up victory three four palm"),
     "group1": (
