@@ -74,7 +74,7 @@ FOUND = [detection_of(HERE), detection_of(THERE)]
 
 
 def test_each_track_is_looked_at_where_it_will_be_as_a_hand_of_its_side() -> None:
-    detector, seen, _ = looked(known(), known(THERE, side="left", asked_s=FRAME_S))
+    detector, seen, _ = looked(known(), known(THERE, side="left", asked_s=2 * FRAME_S))
     assert [(one.side, one.row) for one in seen] == [("right", 0), ("left", 1)]
     for one, pose in zip(seen, (HERE, THERE), strict=True):
         assert at(one.detection) == pytest.approx(at(detection_of(pose)), abs=0.01)

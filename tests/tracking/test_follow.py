@@ -123,9 +123,10 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
 
 
 @pytest.mark.parametrize(
-    ("odds", "asked_s", "rests"), [(3.0, 0.0, True), (3.0, 0.04, False), (0.0, 0.0, False)]
+    ("odds", "asked_s", "rests"),
+    [(3.0, 0.0, True), (3.0, 0.04, True), (3.0, 0.08, False), (0.0, 0.0, False)],
 )
-def test_a_sure_hand_that_nobody_asked_for_is_looked_at_in_every_second_frame(
+def test_a_sure_hand_that_nobody_asked_for_is_looked_at_in_every_third_frame(
     odds: float, asked_s: float, rests: bool
 ) -> None:
     other = replace(track_of(THERE), log_odds=odds, asked_s=asked_s)
