@@ -52,6 +52,11 @@ def test_an_assignment_costs_as_little_as_scipy_s(shape: tuple[int, int]) -> Non
         assert cost[range(shape[0]), found].sum() == pytest.approx(expected)
 
 
+def test_costs_that_are_no_numbers_end_the_search_all_the_same() -> None:
+    cost = np.full((2, 3), np.nan)
+    assert len(set(least_cost(cost))) == 2
+
+
 @pytest.mark.parametrize("shape", [(1, 1), (3, 2), (2, 4), (4, 3), (3, 0), (0, 2)])
 def test_as_many_tracks_as_possible_have_a_detection_and_none_an_impossible_one(
     shape: tuple[int, int],

@@ -112,7 +112,7 @@ def _assign_rows(cost, found):
         for other in range(columns + 1):
             done[other] = False
         for other in range(columns):
-            away[other], before[other] = np.inf, -1
+            away[other], before[other] = np.inf, columns
         while row_of[column] >= 0:
             done[column] = True
             at, nearest, step = row_of[column], -1, np.inf
@@ -122,7 +122,7 @@ def _assign_rows(cost, found):
                 reduced = cost[at, other] - row_worth[at] - column_worth[other]
                 if reduced < away[other]:
                     away[other], before[other] = reduced, column
-                if away[other] < step:
+                if nearest < 0 or away[other] < step:  # some column also where a cost is no number
                     nearest, step = other, away[other]
             for other in range(columns + 1):
                 if done[other]:
