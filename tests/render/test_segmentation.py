@@ -12,7 +12,6 @@ from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.trust import TIPS
-from toftrack.render.numba.median import thinned
 from toftrack.render.segmentation import Expected, NearestSurface, reduce_image
 
 HEIGHT, WIDTH, FOCAL = 60, 80, 100.0
@@ -294,12 +293,3 @@ def test_a_reach_beyond_the_image_or_behind_the_camera_is_no_error() -> None:
     for x, y, z in ((0, 0, 1e-3), (1e6, -1e6, 0.5), (0, 0, 1e9), (-50, 0, 0.1), (0, 0, -0.3)):
         seen = nearest_surface()(depth, K, Expected(0.4, 0.6, (x, y, z)))
         assert seen.hand.shape == depth.shape
-
-
-@pytest.mark.parametrize("shape, factor", [((7, 11), 3), ((61, 83), 4), ((144, 352), 5)])
-def test_a_large_image_is_filtered_only_where_it_is_read(shape: tuple[int, int], factor) -> None:
-    rng = np.random.default_rng(0)
-    depth = np.where(rng.random(shape) < 0.2, 0, rng.random(shape)).astype(np.float32)
-    kept = slice((factor - 1) // 2, None, factor)
-    expected = cv2.medianBlur(depth, 5)[kept, kept]
-    np.testing.assert_array_equal(thinned(depth, factor, kept.start), expected)

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
 from toftrack.errors import check_number
-from toftrack.render.numba.median import thinned
 
 _NEAREST_M = 0.05
 """No camera sees anything nearer."""
@@ -231,14 +230,11 @@ def reduce_image(
     factor = int(np.ceil(np.sqrt(depth_m.size / max_pixels)))
     if factor <= 1:
         return np.require(depth_m, np.float32, ("C", "W")), k
-    depth_m, offset = np.ascontiguousarray(depth_m, np.float32), (factor - 1) // 2
-    if factor == 2:
-        small = cv2.medianBlur(depth_m, 3)[offset::factor, offset::factor]
-    else:
-        small = thinned(depth_m, factor, offset)
-    k = k.copy()
+    offset, k = (factor - 1) // 2, k.copy()
+    filtered = cv2.medianBlur(np.ascontiguousarray(depth_m, np.float32), 3)
+    small = np.ascontiguousarray(filtered[offset::factor, offset::factor])
     k[0] /= factor
     k[1] /= factor
     k[0, 2] -= offset / factor
     k[1, 2] -= offset / factor
-    return np.ascontiguousarray(small), k
+    return small, k
