@@ -6,9 +6,11 @@ import logging
 import os
 import pickle
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import filelock
 import numba
 import numpy as np
 import pytest
@@ -60,7 +62,7 @@ def test_a_kernel_is_compiled_once_for_all_runs(folder: Path, caplog) -> None:
     kernel = _made()
     assert not kernel.is_compiled
     kernel(np.arange(3.0))
-    assert kernel.is_compiled and len(_files(folder)) == 2
+    assert kernel.is_compiled and len(_files(folder)) == 3, "index, code and lock"
     assert _is_loaded() and not caplog.messages
     assert str(folder.parents[1]) == numba.config.CACHE_DIR, "for the kernels of others"
 
@@ -163,3 +165,25 @@ def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setenv("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", str(tmp_path))
     assert compiling._private_folder() == tmp_path / "toftrack" / "kernels"
+
+
+def test_what_another_process_is_compiling_is_waited_for() -> None:
+    values, kernel = np.arange(3.0), _made()
+    assert not _is_loaded()
+    with filelock.FileLock(f"{compiling._cached(kernel.function).stats.cache_path}.lock"):
+        waits = threading.Thread(target=kernel, args=(values,))
+        waits.start()
+        waits.join(0.5)
+        assert waits.is_alive()
+    waits.join()
+    assert values[1] == FACTOR
+
+
+def test_where_nothing_can_be_locked_it_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refused(self: filelock.FileLock) -> None:
+        raise OSError("no locks here")
+
+    monkeypatch.setattr(filelock.FileLock, "acquire", refused)
+    assert not _is_loaded() and _is_loaded()

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import filelock
 import numba
 import numpy as np
 from llvmlite import ir
@@ -62,7 +63,8 @@ class Kernel:
         with lock, _collector_paused():
             self.dispatcher = self.dispatcher or _cached(self.function)
             _announce(self.dispatcher)
-            return self._run(args)
+            with _only_one_process(self.dispatcher.stats.cache_path):
+                return self._run(args)
 
     def _run(self, args: tuple) -> Any:
         try:
@@ -100,6 +102,21 @@ def _collector_paused() -> Iterator[None]:
             gc.enable()
 
 
+@contextlib.contextmanager
+def _only_one_process(cache_path: str | None) -> Iterator[None]:
+    """What another process is compiling is waited for, and then loaded."""
+    beside = filelock.FileLock(f"{cache_path}.lock")
+    try:
+        if cache_path:
+            beside.acquire()
+    except (OSError, NotImplementedError) as error:  # then both compile
+        log.debug(f"'{beside.lock_file}' cannot be locked ({error})")
+    try:
+        yield
+    finally:
+        beside.release()
+
+
 def _cached(function: Callable) -> Any:
     """numba's function with a cache, or without one where it cannot be trusted or written."""
     before = _config.CACHE_DIR
@@ -128,6 +145,14 @@ def _private_folder() -> Path:
     if hasattr(os, "geteuid") and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
         raise PermissionError(f"'{folder}' must belong to this user and be closed to others")
     return folder
+
+
+def nothing_kept() -> bool:
+    """Whether this user has never had a kernel compiled, as far as can be seen."""
+    try:
+        return not any(_private_folder().iterdir())
+    except (OSError, RuntimeError):
+        return False
 
 
 def _fingerprint(function: Callable) -> str:

@@ -46,9 +46,12 @@ def track_job(config: DictConfig) -> float:
     """Track, write the results, and return what a sweep minimises."""
     # The device comes before the seconds that torch takes: a missing camera is reported at once.
     device = instantiate(config.device)
-    from toftrack.programs.track import track
+    from toftrack.programs.ahead import compiling_ahead
 
-    return track(config, device)
+    with compiling_ahead():
+        from toftrack.programs.track import track
+
+        return track(config, device)
 
 
 @command_line.sweep_job
