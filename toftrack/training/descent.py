@@ -40,7 +40,7 @@ from toftrack.training.images import (
     wide_images,
 )
 from toftrack.training.losses import finder_loss, pose_losses
-from toftrack.training.muon import Muon
+from toftrack.training.muon import Muon, half_precision
 
 _WARM = 300
 """Steps in which the rate rises."""
@@ -130,7 +130,7 @@ def train_poses(
 
     def losses(crops: Crops) -> tuple[Tensor, dict[str, Tensor]]:
         image = _image(crops.image, device)
-        with torch.autocast(device.type, torch.bfloat16, cache_enabled=False):
+        with _mixed_precision(device, cache_enabled=False):
             outputs = network.features(image)
         return pose_losses(network.decode(image, *outputs), crops, network.anchors)
 
@@ -153,13 +153,19 @@ def train_finder(
 
     def losses(images: WideImages) -> tuple[Tensor, dict[str, Tensor]]:
         image = _image(images.image, device)
-        with torch.autocast(device.type, torch.bfloat16):
+        with _mixed_precision(device):
             found = network(image)
         loss = finder_loss(found, images)
         return loss, {"loss": loss.detach()}
 
     task = Task("finder", wide_images, losses)
     return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
+
+
+def _mixed_precision(device: torch.device, cache_enabled: bool = True) -> torch.autocast:
+    """In it, networks compute in bfloat16 where that is fast."""
+    half = half_precision(device) is torch.bfloat16
+    return torch.autocast(device.type, torch.bfloat16, half, cache_enabled)
 
 
 def _image(image: Tensor, device: torch.device) -> Tensor:
