@@ -42,8 +42,8 @@ def without_flying_pixels(depth_m: np.ndarray, k: np.ndarray, widths: float) -> 
 def _sweep(depth, part, first, end, left):
     """Rows `first` to `end` of an image, see above, into `left`.  part: of a depth.
 
-    The outer columns stay. By the second least of eight gaps, which LLVM computes for many pixels at
-    once; counting takes twice as long.
+    The outer columns stay. By the second least of eight gaps, which LLVM computes for many pixels
+    at once; counting takes twice as long.
     """
     height, width, nothing = depth.shape[0], depth.shape[1], np.float32(0)
     beyond = np.full(width, _FAR, np.float32)
