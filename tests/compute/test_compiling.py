@@ -179,6 +179,14 @@ def test_what_another_process_is_compiling_is_waited_for() -> None:
     assert values[1] == FACTOR
 
 
+def test_what_another_process_never_finishes_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(compiling, "_PATIENCE_S", 0.1)
+    with filelock.FileLock(f"{compiling._cached(_made().function).stats.cache_path}.lock"):
+        assert not _is_loaded()
+
+
 def test_where_nothing_can_be_locked_it_is_compiled_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

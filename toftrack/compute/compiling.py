@@ -38,6 +38,8 @@ OPTIONS = {
 compiled: Any = numba.njit(**OPTIONS, no_cpython_wrapper=True)
 """Decorator of the functions that kernels call, and that Python cannot."""
 
+_PATIENCE_S = 120.0
+"""What another process does not finish in that time is compiled here as well: it may be stopped."""
 _config: Any = numba.config
 lock = threading.RLock()
 """Of the thread that compiles."""
@@ -105,11 +107,11 @@ def _collector_paused() -> Iterator[None]:
 @contextlib.contextmanager
 def _only_one_process(cache_path: str | None) -> Iterator[None]:
     """What another process is compiling is waited for, and then loaded."""
-    beside = filelock.FileLock(f"{cache_path}.lock")
+    beside = filelock.FileLock(f"{cache_path}.lock", timeout=_PATIENCE_S)
     try:
         if cache_path:
             beside.acquire()
-    except (OSError, NotImplementedError) as error:  # then both compile
+    except (OSError, NotImplementedError) as error:  # also of patience: then both compile
         log.debug(f"'{beside.lock_file}' cannot be locked ({error})")
     try:
         yield
