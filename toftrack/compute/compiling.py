@@ -107,11 +107,13 @@ def _collector_paused() -> Iterator[None]:
 @contextlib.contextmanager
 def _only_one_process(cache_path: str | None) -> Iterator[None]:
     """What another process is compiling is waited for, and then loaded."""
+    if not cache_path:
+        yield
+        return
     beside = filelock.FileLock(f"{cache_path}.lock", timeout=_PATIENCE_S)
     try:
-        if cache_path:
-            beside.acquire()
-    except (OSError, NotImplementedError) as error:  # also of patience: then both compile
+        beside.acquire()
+    except (OSError, NotImplementedError) as error:  # or it took too long: both compile
         log.debug(f"'{beside.lock_file}' cannot be locked ({error})")
     try:
         yield
