@@ -97,7 +97,7 @@ def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
 
 @pytest.mark.parametrize("hands", [1, 2, 4])
 def test_a_hand_keeps_its_slot(hands: int) -> None:
-    state = before(hands, track=1, known=True)
+    state = before(hands, track=1, known="right")
     assert numbers(state, hand(0), hand(1))[0] == 1
     while_lost = numbers(state, hand(0), hand(1, lost=True, log_odds=1.2))
     assert while_lost[:2] == [1, 0][:hands]
@@ -105,7 +105,7 @@ def test_a_hand_keeps_its_slot(hands: int) -> None:
 
 def test_the_only_slot_goes_to_a_hand_that_is_much_surer() -> None:
     """As when an elbow was taken for the hand while something hid it."""
-    state = before(track=1, known=True)
+    state = before(track=1, known="right")
     assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=0.0)) == [0]
     assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=1.5)) == [1]
 
@@ -157,8 +157,16 @@ def test_of_more_hands_than_slots_the_first_ones_are_reported() -> None:
 def test_where_no_side_was_said_a_hand_that_comes_may_be_the_first_one_again(
     side: str, away_s: float, taken: bool
 ) -> None:
-    state = before(known=True, away_s=away_s)
+    state = before(known="right", away_s=away_s)
     assert numbers(state, hand(1, side)) == [1 if taken else -1]
+
+
+def test_what_is_taken_for_a_hand_meanwhile_does_not_change_which_one_may_come_back() -> None:
+    state, _ = reported(before(), hand(0, "left"))
+    for side in ("left", "right"):  # what is no hand seems of one side and of the other
+        state, _ = reported(state, hand(1, side, confirmed=False, lost=True))
+    assert [slot.track for slot in state.slots] == [1]
+    assert numbers(state, hand(2, "left")) == [2]
 
 
 # What is said of it.

@@ -114,9 +114,9 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
     if wanted is not None:
         agrees = right if wanted == "right" else -right
         return worth + min(max(agrees, -_MOST), _MOST) + (0 if several == 1 else _MOST)
-    if not slot.known or stays:
+    if slot.known is None or stays:
         return worth + 0.1
-    agrees = right if slot.side == "right" else -right
+    agrees = right if slot.known == "right" else -right
     if several == 1 and agrees < 0 and slot.away_s < _GONE_S:
         return -1.0
     return worth + 0.1 + 0.3 * min(max(agrees, -_MOST), _MOST)
@@ -156,7 +156,7 @@ def report_track(
         track=track.number,
         side=track.side,
         shape=track.shape,
-        known=slot.known or track.confirmed,
+        known=track.side if track.confirmed else slot.known,
         away_s=slot.away_s if estimate.lost else 0.0,
         joint_features=rows,
     )

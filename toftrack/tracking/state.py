@@ -119,7 +119,8 @@ class Slot:
     """A place of the report, for one hand.
 
     track: number of the track that is reported here; -1 = none.
-    side, shape: of the last track here.  known: whether one of them was ever confirmed.
+    side, shape: of the last track here.  known: the side of the last one that was confirmed, which
+        what is taken for a hand meanwhile does not change; None = none ever was.
     last: the last believed estimate, else the last one; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
     away_s: how long ago a hand was believed here; inf = never.
@@ -130,7 +131,7 @@ class Slot:
     shape: ShapeEstimate
     last: Estimate
     track: int = -1
-    known: bool = False
+    known: str | None = None
     gesture: GestureState | None = None
     away_s: float = math.inf
     joint_features: np.ndarray = field(default_factory=lambda: np.zeros((21, len(JOINT_FEATURES))))
