@@ -44,19 +44,13 @@ def test_a_tracked_hand_is_reported_with_all_its_joints(receiver: socket.socket)
     for name, place in zip(JOINT_NAMES, estimate.joints_m, strict=True):
         assert found[f"/toftrack/left/joint/{name}"] == pytest.approx(place.tolist())
     assert not any("pointing" in address or "openxr" in address for address in found)
-
-
-def test_a_pinch_that_a_doubted_tip_ends_is_reported(receiver: socket.socket) -> None:
-    reported = {"gesture": "", "gesture_probability": np.nan, "pinch": np.nan}
-    found = sent(receiver, replace(hand_estimate(7), joint_ok=np.arange(21) != 8, **reported))
-    assert found["/toftrack/right/joint_ok"] == [1] * 8 + [0] + [1] * 12
-    assert found["/toftrack/right/pinch"] == [0, 0] and "/toftrack/right/gesture" not in found
-
-
-def test_the_pointing_ray_is_sent_while_there_is_one(receiver: socket.socket) -> None:
     ray = np.arange(6, dtype=np.float32)
-    estimate = replace(hand_estimate(0), pointing_origin_m=ray[:3], pointing_direction=ray[3:])
-    assert sent(receiver, estimate)["/toftrack/right/pointing"] == ray.tolist()
+    estimate = replace(estimate, pointing_origin_m=ray[:3], pointing_direction=ray[3:])
+    doubted = {"joint_ok": np.arange(21) != 8, "gesture": "", "pinch": np.nan}
+    found = sent(receiver, replace(estimate, **doubted, pinching=False))
+    assert found["/toftrack/left/pointing"] == ray.tolist()
+    assert found["/toftrack/left/joint_ok"] == [1] * 8 + [0] + [1] * 12
+    assert found["/toftrack/left/pinch"] == [0, 0] and "/toftrack/left/gesture" not in found
 
 
 def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> None:

@@ -25,6 +25,7 @@ from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.frames.frame import Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output import records
 from toftrack.output.lines import (
     FRAME_FIELDS,
     HAND_FIELDS,
@@ -172,12 +173,6 @@ def test_summary_counts_and_averages(tmp_path: Path) -> None:
     assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
 
 
-def test_a_first_run_s_compiling_is_not_the_time_of_a_frame(tmp_path: Path) -> None:
-    slow = [estimate(i, compute_s=9.0 if i == 0 else 0.01) for i in range(5)]
-    line = metrics_table(write(tmp_path, slow).summary).splitlines()[1]
-    assert "10.0 ms (100.0 frames/s), the median; the mean, 1808.0 ms, holds what is" in line
-
-
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     estimates = [estimate(i) for i in range(12)]
     truth = truth_of(estimates, frames=20)  # the run was interrupted after 12 of 20
@@ -192,14 +187,8 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     assert further["swap_pct"] == 0 and further["tip_mm"] == pytest.approx(10 * math.sqrt(3))
     assert summary["metrics"] == expected | {"further": further}
     assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
-    table = metrics_table(summary).splitlines()
-    assert table[0].split() == "usable 75.0 % of the 12 visible frames".split()
-    assert table[2].split() == "false alarms 25.0 %".split()
-    truth.joints_m[0, 8] += 0.05
-    there = metrics_table(write(tmp_path / "b", estimates, truth).summary).splitlines()[0]
-    assert there.endswith("; in 8.3 % some joints are over 40 mm off, their mean is not")
-    assert "in their 90 % region  100.0 % of the joints" in table
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
+    assert "75.0 % of the 12 visible frames" in metrics_table(summary).splitlines()[0]
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
@@ -302,7 +291,11 @@ def test_a_folder_that_is_removed_or_renamed_is_reported(tmp_path: Path) -> None
     assert recover(tmp_path / "now")["frames"] == 1
 
 
-def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "_PIECE", 16)  # frames that are held at once
+
     def peak(frames: int) -> int:
         tracemalloc.start()
         with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
@@ -313,8 +306,8 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
         return found
 
     one = estimate(0)
-    few, many = peak(600), peak(800)
-    assert many - few < 200 * 200  # a frame's numbers alone are 1100 bytes
+    few, many = peak(100), peak(200)
+    assert many - few < 100 * 200  # a frame's numbers alone are 1100 bytes
 
 
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
@@ -331,25 +324,20 @@ def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("number", "bad", "words"),
+    ("number", "changes", "words"),
     [
-        (1, "{]", "line 2 of"),
-        (1, '{"index":1}', "shortly before"),
-        (0, {"index": None}, "'index'"),
+        (1, None, "line 2 of"),
         (0, {"joints_m": [[0, 0, 0]]}, "shape"),
         (0, {"index": 10**19}, "shortly before"),
     ],
 )
 def test_a_line_that_is_damaged_is_named(
-    tmp_path: Path, number: int, bad: str | dict[str, Any], words: str
+    tmp_path: Path, number: int, changes: dict[str, Any] | None, words: str
 ) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"
     lines = path.read_text().splitlines()
-    if isinstance(bad, dict):
-        line = json.loads(lines[number]) | bad
-        bad = json.dumps({k: v for k, v in line.items() if v is not None or k not in bad})
-    lines[number] = bad
+    lines[number] = "{]" if changes is None else json.dumps(json.loads(lines[number]) | changes)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(ToftrackError, match=words):
         recover(tmp_path)
@@ -425,11 +413,11 @@ def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
 
 
-@pytest.mark.parametrize("content", [None, b"", b"text", b"PK\x03\x04broken"])
-def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | None) -> None:
+def test_a_file_that_is_no_result_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
-    if content is not None:
-        path.write_bytes(content)
+    with pytest.raises(ToftrackError, match="track.npz"):
+        read_results(path)
+    path.write_bytes(b"PK\x03\x04broken")
     with pytest.raises(ToftrackError, match="track.npz"):
         read_results(path)
 
@@ -438,7 +426,6 @@ def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | N
     "changes",
     [
         {"lost": np.array(False)},
-        {"lost": np.zeros((2, 1, 1), bool)},
         {"score": np.zeros((2, 3), np.float32)},
         {"metadata": np.array("[]")},
     ],

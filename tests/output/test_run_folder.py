@@ -48,8 +48,3 @@ def test_a_run_tells_its_arrays_times_camera_and_summary(tmp_path: Path) -> None
     assert (run.camera.width, run.camera.height) == (160, 120)
     np.testing.assert_array_equal(run.camera.K, camera.K)
     assert run.estimate(2).index == 2
-
-
-def test_a_run_that_does_not_say_its_camera_is_reported(folder: Path) -> None:
-    with pytest.raises(ToftrackError, match="with which camera"):
-        _ = read_run(folder).camera

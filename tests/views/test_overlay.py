@@ -9,14 +9,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.moments import one_hand
 from helpers.videos import video_frames
 
 from toftrack.errors import MOST_HANDS, ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate, no_estimate
-from toftrack.frames.frame import Frame
-from toftrack.hand.shape import default_hand_shape
 from toftrack.views.overlay import (
     CAPTION_PX,
     VideoView,
@@ -25,7 +22,7 @@ from toftrack.views.overlay import (
     film_tile,
     filmstrip,
 )
-from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB, side_words
+from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -127,24 +124,6 @@ def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:
     assert colour_share(two(lost_hand(), lost_hand())[0], (40, 40, 220)) > 0.5
 
 
-def test_a_side_is_said_with_how_sure_it_is_unless_it_was_given() -> None:
-    assert [side_words(one) for one in (present(), other_hand(), lost_hand())] == [
-        *("right", "left 83 %", ""),
-    ]
-    assert side_words(other_hand(side_probability=0.999)) == "left 99 %"
-
-
-@pytest.mark.parametrize(
-    ("size", "scale"), [((144, 176), 3), ((480, 640), 1), ((7, 5), 1), ((9, 11), 1.5)]
-)
-def test_panel_sides_are_even(size: tuple[int, int], scale: float) -> None:
-    camera = Camera(CAMERA.K, size[1], size[0])
-    panel = draw_panel(np.ones(size, np.float32), None, camera, (lost_hand(),), (None,), scale)
-    assert panel.dtype == np.uint8
-    assert panel.shape[0] % 2 == panel.shape[1] % 4 == 0
-    assert panel.shape[2] == 3
-
-
 @pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
 def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
     one = hand()
@@ -230,14 +209,6 @@ def test_captions_can_be_read_in_a_filmstrip_of_1280_px(reported: tuple[Estimate
         assert columns[-1] < caption.shape[1] - 1
 
 
-def test_images_without_any_reading_are_black() -> None:
-    for depth in (np.zeros((H, W), np.float32), np.full((H, W), np.nan, np.float32)):
-        one = dataclasses.replace(lost_hand(), lost=False)
-        _, left, right = sides(draw_panel(depth, None, CAMERA, (one,), (np.zeros((H, W)),), 3))
-        assert (left == 0).all()
-        assert (right == 255).all()
-
-
 def panel_of(value: int, size: tuple[int, int] = (CAPTION_PX + 50, 160)) -> np.ndarray:
     return np.full((*size, 3), value, np.uint8)
 
@@ -255,7 +226,7 @@ def test_video_has_every_panel_at_the_rate(tmp_path: Path) -> None:
     assert [frame.mean() for frame in frames] == pytest.approx([8 * i for i in range(30)], abs=6)
 
 
-@pytest.mark.parametrize("fps", [29.97002997, 1e-3, 5000.0, math.nan])
+@pytest.mark.parametrize("fps", [29.97002997, 1e-3, math.nan])
 def test_odd_rates_and_sizes_give_a_readable_video(tmp_path: Path, fps: float) -> None:
     """Panels of other and odd sizes share an even one."""
     with VideoView(tmp_path, fps, None) as view:
@@ -265,7 +236,7 @@ def test_odd_rates_and_sizes_give_a_readable_video(tmp_path: Path, fps: float) -
     assert [frame.shape for frame in frames] == [(96, 160, 3)] * 2 and 1 <= found <= 120
 
 
-@pytest.mark.parametrize(("count", "known"), [(10, True), (100, False), (1000, True), (700, False)])
+@pytest.mark.parametrize(("count", "known"), [(10, True), (100, True), (170, False)])
 def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known: bool) -> None:
     with VideoView(tmp_path, 25, count if known else None) as view:
         for i in range(count):
@@ -280,16 +251,6 @@ def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known
     np.testing.assert_allclose(shown, np.linspace(0, count - 1, 10), atol=0.035 * count + 0.6)
 
 
-def test_filmstrip_shows_the_left_side_above_the_right(tmp_path: Path) -> None:
-    panel = panel_of(100)
-    panel[CAPTION_PX:, :80], panel[CAPTION_PX:, 80:] = 50, 200
-    with VideoView(tmp_path, 25, 1) as view:
-        view.add(panel)
-    strip = cv2.imread(str(tmp_path / "overlay.png"))
-    column = strip[:, strip.shape[1] // 2, 0].tolist()
-    assert column.index(100) < column.index(50) < column.index(200)
-
-
 def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
     VideoView(tmp_path, 25, 10).close()
     assert list(tmp_path.iterdir()) == []
@@ -298,12 +259,3 @@ def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
 def test_a_video_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError, match="overlay.mp4.*view=none"):
         VideoView(tmp_path / "nowhere", 25, 10).add(panel_of(1))
-
-
-def test_a_tracked_frame_is_appended_as_its_panel(tmp_path: Path) -> None:
-    frame = Frame(7, 0.28, DEPTH, AMPLITUDE, radial=False)
-    with VideoView(tmp_path, 25, 2) as view:
-        view.show(one_hand(frame, DEPTH, CAMERA, hand(), default_hand_shape()))
-        assert not view.commands()
-    assert (tmp_path / "overlay.mp4").stat().st_size > 0
-    assert colour_share(cv2.imread(str(tmp_path / "overlay.png")), THUMB) > 0
