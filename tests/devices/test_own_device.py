@@ -85,17 +85,21 @@ def test_its_own_error_is_reported_in_one_sentence(
 
 
 @pytest.mark.parametrize(
-    ("what", "words"),
+    ("second", "words"),
     [
-        ("None", "a device must yield Frame(index, timestamp_s, "),
-        ("(_ for _ in ()).throw(OSError(19, 'No such device'))", "No such device, in RawImages"),
+        ("yield None", "a device must yield Frame(index, timestamp_s, "),
+        ("raise OSError(19, 'No such device')", "No such device, in RawImages"),
     ],
 )
 def test_what_goes_wrong_is_told_with_the_place_and_what_came_before_is_kept(
-    workplace: Path, track: Callable, what: str, words: str
+    workplace: Path, track: Callable, second: str, words: str
 ) -> None:
     code = (workplace / "my_device.py").read_text()
-    code = code.replace("yield Frame(", f"yield {what} if index == 2 else Frame(")
+    here = "\n                yield Frame("
+    assert here in code
+    code = code.replace(
+        here, f"\n                if index == 2:\n                    {second}{here}"
+    )
     (workplace / "my_device.py").write_text(code)
     status, _, err = track("device.path=images.raw", "device.focal_px=200")
     assert status == 1 and f"error: {words}" in err

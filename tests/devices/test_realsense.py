@@ -121,38 +121,6 @@ def test_a_part_of_a_recording_keeps_its_indices_and_can_be_read_again(recording
         assert frames[0].amplitude is None
 
 
-def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) -> None:
-    device = realsense(bag=recording, realtime=True)
-    indices = []
-    for frame in device:
-        indices.append(frame.index)
-        time.sleep(0.05)
-    assert indices == sorted(set(indices))
-    assert 5 < len(indices) < 60
-    assert device.dropped > 30
-
-
-def test_a_start_behind_the_end_is_reported(recording: Path) -> None:
-    with pytest.raises(ToftrackError, match="no frame from start=100 on, but 100 before"):
-        list(realsense(bag=recording, start=100))
-
-
-def test_a_recording_without_depth_is_reported(rs: ModuleType, tmp_path: Path) -> None:
-    class InfraredOnly(EmulatedCamera):
-        def _stream(self, uid: int, kind: Any, index: int, pixel_format: Any) -> Any:
-            if kind == rs.stream.depth:
-                return None
-            return super()._stream(uid, kind, index, pixel_format)
-
-        def _deliver(self, profile: Any, pixels: np.ndarray, number: int) -> None:
-            if profile is not None:
-                super()._deliver(profile, pixels, number)
-
-    path = record(rs, tmp_path / "infrared.db3", InfraredOnly(rs, FINE))
-    with pytest.raises(ToftrackError, match="infrared.* has no depth images"):
-        realsense(bag=path)
-
-
 def test_what_is_no_recording_is_reported(rs: ModuleType, tmp_path: Path, recording: Path) -> None:
     for content in (b"", b"text", recording.read_bytes()[:5000]):
         for suffix in (".bag", ".db3"):

@@ -139,17 +139,6 @@ def test_a_frame_in_two_transfers_at_every_packet(sample: list[Any]) -> None:
     assert device.counts.damaged == 0
 
 
-@pytest.mark.parametrize(
-    ("kind", "distance"), [("zeros", 0.0), ("ones", unambiguous_range_m(20)), ("garbage", None)]
-)
-def test_nonsense_of_the_right_length_is_a_frame(kind: str, distance: float | None) -> None:
-    frames = read(camera(f"{kind}@1", stop=3))
-    assert [frame.index for frame in frames] == [0, 1, 2]
-    assert np.isfinite(frames[1].depth).all()
-    if distance is not None:
-        np.testing.assert_allclose(frames[1].depth, distance, rtol=1e-6)
-
-
 def test_a_camera_that_never_answers_is_reported() -> None:
     with pytest.raises(ToftrackError, match="libmesasr.*emulated"):
         read(camera("timeout"))
@@ -259,19 +248,6 @@ def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted() -> None
     assert counts.delivered == len(indices)
     assert counts.delivered + counts.dropped == counts.received == device.emulator.served == 100
     assert device.live and device.dropped == counts.dropped
-
-
-def test_stopping_delivers_what_was_received() -> None:
-    device, indices = camera(loop=True, queue_frames=20), []
-    with device:
-        for frame in device:
-            indices.append(frame.index)
-            if frame.index == 0:
-                while device.counts.received < 16:
-                    time.sleep(0.001)
-                device.request_stop()
-    assert len(indices) == device.counts.received > 15
-    assert indices == list(range(len(indices)))
 
 
 def test_every_kind_of_fault_in_turn_and_every_good_frame_accounted_for() -> None:

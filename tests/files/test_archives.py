@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from toftrack.files.archives import (
-    MOST_TEXT_BYTES,
     PickledError,
     Pieces,
     read_archive,
@@ -84,10 +83,10 @@ def test_arrays_of_every_kind_are_read_as_numpy_does(tmp_path: Path, method: int
 
 
 def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path) -> None:
-    shape = (32, 2**20 // 4)
-    path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 32]}, DEFLATED)
-    assert path.stat().st_size < 2**18
-    assert "'a': it would make 34 MB of" in reported(path)
+    shape = (80, 2**20 // 4)
+    path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 80]}, DEFLATED)
+    assert path.stat().st_size < 2**20
+    assert "'a': it would make 84 MB of" in reported(path)
 
 
 def with_more_than_stated(path: Path, method: int) -> Path:
@@ -160,18 +159,6 @@ def test_objects_are_refused(tmp_path: Path) -> None:
         read_archive(tmp_path / "a.npz")
 
 
-def test_a_text_that_is_too_long_is_refused(tmp_path: Path) -> None:
-    length = MOST_TEXT_BYTES // 4 + 1
-    pieces = [header((), f"<U{length}"), *[ZEROS] * 16, bytes(4)]
-    path = save(tmp_path / "a.npz", {"a": pieces}, DEFLATED)
-    assert "'a': it is a text of 17 MB" in reported(path)
-
-
-def test_other_compressions_are_refused(tmp_path: Path) -> None:
-    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
-    assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
-
-
 @every_method
 def test_random_damage_never_ends_otherwise_than_with_a_value_error(
     tmp_path: Path, method: int
@@ -191,13 +178,3 @@ def test_random_damage_never_ends_otherwise_than_with_a_value_error(
             refused += 1
             assert "\n" not in str(error)
     assert refused > 30
-
-
-@pytest.mark.parametrize("kind", ["<U2", ">U2"])
-def test_characters_that_are_none_are_reported(kind: str, tmp_path: Path) -> None:
-    whole = np.array(["a", "\U0010ffff"], kind)
-    path = save(tmp_path / "a.npz", {"a": npy(whole)}, STORED)
-    assert read_archive(path)["a"].tolist() == whole.tolist()
-    broken = npy(whole)[:-4] + b"\x7f\x7f\x7f\x7f"
-    path = save(tmp_path / "b.npz", {"a": broken}, STORED)
-    assert "text is damaged" in reported(path)

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from toftrack.files import safe_files
 from toftrack.files.safe_files import (
     leave_folder,
     lock_folder,
@@ -135,26 +134,11 @@ def test_a_file_that_is_there_is_only_replaced_when_asked(path: Path) -> None:
         open_in_place(path.with_name("other"), make=False)
 
 
-def test_links_are_read_through(path: Path, elsewhere: Path) -> None:
-    path.symlink_to(elsewhere)
-    with open_to_read(path) as stream:
-        assert stream.read() == b"precious"
-
-
 def test_a_folder_that_is_a_link_is_refused(path: Path, tmp_path: Path) -> None:
     path.symlink_to(tmp_path, target_is_directory=True)
     with pytest.raises(OSError, match="symbolic link"):
         make_folder(path)
     make_folder(path.with_name("other"))
-
-
-def test_where_the_system_knows_no_such_flag_links_are_refused_all_the_same(
-    path: Path, elsewhere: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(safe_files, "_NO_LINK", 0)
-    path.symlink_to(elsewhere)
-    with pytest.raises(OSError, match="symbolic link"):
-        open_in_place(path)
 
 
 @pytest.mark.parametrize("write", [WRITERS["write_whole"], WRITERS["open_new"]])

@@ -14,7 +14,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import calibration
-from toftrack.frames.calibration import DepthPairs, View
+from toftrack.frames.calibration import View
 from toftrack.frames.camera import Camera
 from toftrack.programs import calibrate, command_line
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
@@ -125,7 +125,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A board from 0.33 to 1.5 m, with noise and a depth error; nothing is said of the camera."""
     path, rng = tmp_path_factory.mktemp("calibration") / "board.srs", np.random.default_rng(0)
     with SrsWriter(path, facts=SrsFacts(RANGE_M)) as writer:
-        for number, pose in enumerate(board_poses(20, 0.33, 1.5, (0.27, 0.21))):
+        for number, pose in enumerate(board_poses(24, 0.33, 1.5, (0.27, 0.21))):
             images = render_board(TRUE, BOARD, SQUARE_M, pose, rng, wiggle)
             writer.append(encode_frame(*images, RANGE_M), number / 25)
     return path
@@ -188,7 +188,7 @@ def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:
     assert facts["before"]["board_rms_mm"] > 5
     assert facts["after"]["board_rms_mm"] < 2
     assert facts["order"] in range(1, 8)
-    assert facts["frames_used"] >= 16
+    assert facts["frames_used"] >= 20
     assert "before" in (folder / "report.txt").read_text()
     for name in ("corners.png", "depth_error.png"):
         picture = cv2.imread(str(folder / name))
@@ -236,34 +236,6 @@ def test_exact_corners_give_the_exact_lens_and_planes() -> None:
         assert np.abs(distance - radial)[on_board].max() < 0.002
 
 
-def test_a_lens_of_another_model_is_a_start_and_a_rational_one_can_be_kept() -> None:
-    rational = (0.5, -0.02, 1e-4, -1e-4, -0.003, 0.9, 0.08, -0.01)
-    starts = {"opencv": rational, "fisheye": (0.1, 0.0, 0.0, 0.0)}
-    views = exact_views(TRUE)
-    for model, coefficients in starts.items():
-        start = Camera(nominal_camera().K, 176, 144, np.array(coefficients), lens=model)
-        lens = calibration.fit_lens(views, BOARD, SQUARE_M, start)
-        np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.01)
-    wide = Camera(TRUE.K, 176, 144, np.array(rational))
-    known = calibration.known_lens(exact_views(wide), BOARD, SQUARE_M, wide)
-    assert known.errors_px.max() < 1e-2
-    np.testing.assert_array_equal(known.camera.distortion, rational)
-    with pytest.raises(ToftrackError, match="fisheye lens cannot be kept.*--keep-lens"):
-        calibration.known_lens(views, BOARD, SQUARE_M, start)
-
-
-def test_the_polynomial_ignores_the_noise_of_single_pixels() -> None:
-    rng = np.random.default_rng(0)
-    view = np.repeat(np.arange(30), 400)
-    true = np.repeat(np.linspace(0.4, 1.4, 30), 400) + rng.uniform(-0.01, 0.01, len(view))
-    measured = true + 0.01 * true + rng.normal(size=len(view)) * 0.02
-    fit = calibration.fit_depth(DepthPairs(measured, true, np.ones(len(view)), view))
-    _, error = calibration.frame_errors(
-        DepthPairs(1.01 * true, true, np.ones(len(view)), view), fit.polynomial
-    )
-    assert np.abs(error).max() < 0.002
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -292,10 +264,3 @@ def test_a_recording_without_amplitude_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", depth_m=np.ones((2, 6, 8), np.float32), K=np.diag((9.0, 9, 1)))
     with pytest.raises(ToftrackError, match="no amplitude"):
         calibrate.main([str(tmp_path / "a.npz"), "--board", "7x5", "--square", "0.03"])
-
-
-def test_boards_at_one_distance_are_reported() -> None:
-    view = np.repeat(np.arange(9), 50)
-    pairs = DepthPairs(np.full(450, 0.8), np.full(450, 0.81), np.ones(450), view)
-    with pytest.raises(ToftrackError, match="near and far"):
-        calibration.fit_depth(pairs)

@@ -102,15 +102,6 @@ def test_no_reading_is_zero() -> None:
         assert z[0, 0] > 0
 
 
-def test_rectify_leaves_its_input_and_plain_depth_alone() -> None:
-    depth = np.random.default_rng(0).uniform(0, 2, (H, W)).astype(np.float32)
-    before = depth.copy()
-    z = Camera(K, W, H).rectify(depth, radial=False)
-    np.testing.assert_array_equal(z, before)
-    z[:] = 9
-    np.testing.assert_array_equal(depth, before)
-
-
 def test_undistortion_never_mixes_two_depths() -> None:
     camera = Camera(K, W, H, DISTORTION)
     depth = np.where(np.arange(W) < W // 2, 0.5, 1.5).astype(np.float32) * np.ones((H, 1))

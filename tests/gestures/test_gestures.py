@@ -175,24 +175,6 @@ def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
         assert set(labels) <= {"other", "pointing", first, last}
 
 
-def test_noise_leaves_a_gesture_what_it_is() -> None:
-    rng = np.random.default_rng(0)
-    for label, angles, thumbs in SHOWN[:6]:
-        for _ in range(20):
-            noisy = of_thumb(angles, thumbs[0]) + rng.normal(0, math.radians(6), 21)
-            assert label_of(noisy) == label
-
-
-def test_a_pose_far_off_the_pose_space_is_less_of_a_gesture_of_the_papers() -> None:
-    flat = seen(pose("palm"))
-    probabilities = [update(None, flat, SURE, off, PAPER)[2] for off in (0.0, 0.2, 0.3)]
-    assert probabilities[0] > probabilities[1] > probabilities[2]
-    assert label_of(pose("palm"), PAPER, off=0.5) == "other"
-    assert update(None, flat, SURE, math.nan, PAPER)[1] == "palm"
-    # Not so for those that a space of three gestures cannot hold.
-    assert label_of(pose("palm"), off=0.5) == "palm"
-
-
 def test_a_bad_score_says_nothing() -> None:
     fist, classes = seen(pose("fist")), len(GESTURES.names)
     _, _, probability = update(None, fist, 0.3, ON, GESTURES)

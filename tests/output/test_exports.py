@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from helpers.animation import Gltf, read_bvh
 from helpers.hands import hand_estimate, lost_hand
-from scipy.spatial.transform import Rotation
 
-from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
@@ -105,22 +103,6 @@ def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
             assert np.allclose(place, gltf.world(held)[name]), (frame, name)
 
 
-def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
-    estimates = [*moving("left")[:2], *moving("right")[2:]]
-    gltf = exported(estimates, "right")
-    for frame in (0, 5):
-        world = gltf.world(frame)
-        for joint, name in enumerate(OPENXR_JOINT_NAMES):
-            turned = Rotation.from_quat(estimates[frame].openxr_orientation[joint]).as_matrix()
-            assert np.allclose(world[f"{name.title()}_R"][:3, :3], turned, atol=1e-5), (frame, name)
-
-
-def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:
-    estimates = [replace(hand, timestamp_s=hand.index % 4 / 25) for hand in moving()]
-    (motion,) = motions_of(results_of(estimates), (default_hand_shape(),))
-    assert np.allclose(motion.time_s, np.arange(8) / 25)
-
-
 def test_a_bvh_puts_the_joints_where_they_were() -> None:
     estimates = moving("left")
     (motion,) = motions_of(results_of(estimates), (default_hand_shape(side="left"),))
@@ -150,9 +132,3 @@ def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
             assert place == pytest.approx(estimate.joints_m[number].tolist(), abs=1e-5)
             assert row[f"{name}_ok"] == str(int(estimate.joint_ok[number]))
         assert row["pointing_origin_x_m"] == ""
-
-
-def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pygltflib", None)
-    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[export\]'"):
-        glb_of([])

@@ -23,7 +23,6 @@ from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.frames.frame import Truth
-from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output import records
 from toftrack.output.lines import (
@@ -200,12 +199,6 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
 
 
-def test_no_frame_at_all_still_gives_whole_files(tmp_path: Path) -> None:
-    write(tmp_path, [], truth_of([], 5))
-    assert read_results(tmp_path / "track.npz")["joints_m"].shape == (0, 21, 3)
-    assert json.loads((tmp_path / "summary.json").read_text())["mean_ms"] is None
-
-
 def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
     done = [estimate(i) for i in range(3, 15) if i != 7]  # 0 to 2 were faulty, 7 came too late
     truth = truth_of([estimate(i) for i in range(20)], 20)[1:]
@@ -361,11 +354,6 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     assert "\n" not in str(error.value)
 
 
-def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(0), replace(estimate(1), index=10**15)])
-    assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
-
-
 @pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])
 def test_what_a_killed_run_left_unfinished_is_dropped(tmp_path: Path, rest: bytes) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
@@ -395,22 +383,6 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     assert [line["index"] for line in read_lines(tmp_path / "track.jsonl")] == [2, 3, 6, 7]
     assert summary["frames"] == 6
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
-
-
-def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
-    metadata = {"K": np.eye(2), "file": Path("a"), "unknown": math.nan, "n": np.int64(3)}
-    ResultWriter(tmp_path, metadata, NAMES, None).close()
-    kept = {"K": [[1, 0], [0, 1]], "file": "a", "unknown": None, "n": 3}
-    assert read_results(tmp_path / "track.npz")["metadata"] == kept
-
-
-def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
-    writer = ResultWriter(tmp_path, {}, NAMES, None)
-    writer.append((estimate(0),))
-    (tmp_path / "track.npz").mkdir()
-    with pytest.raises(ToftrackError, match="cannot be written"):
-        writer.close()
-    assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
 
 
 def test_a_file_that_is_no_result_is_reported(tmp_path: Path) -> None:
@@ -519,45 +491,6 @@ def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_pat
     assert not content["pinching"][0, 1]
 
 
-def test_frames_without_any_hand_are_whole_rows(tmp_path: Path) -> None:
-    """Also where no frame has one: the shapes are as ever."""
-    write_slots(tmp_path / "never", [(vacant(i), vacant(i)) for i in range(3)])
-    write_slots(tmp_path / "none", [])
-    for name, rows in (("never", 3), ("none", 0)):
-        content = read_results(tmp_path / name / "track.npz")
-        assert content["covariance"].shape == (rows, 2, 10, 10)
-        assert content["lost"].all() and np.isnan(content["score"]).all()
-    summary = json.loads((tmp_path / "never" / "summary.json").read_text())
-    assert (summary["lost_frames"], summary["mean_score"]) == (3, None)
-    assert "3, 3 of them lost" in metrics_table(summary)
-
-
-def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
-    write_slots(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)])
-    content = read_results(tmp_path / "track.npz")
-    assert content["metadata"]["held_frames"] == [2, 7]
-    assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
-    there = content["state_name"] != ""  # a slot without a hand says nothing
-    assert ((content["state_name"] == "dropped") == content["dropped"][:, None] & there).all()
-    assert there[2].tolist() == [True, False]
-    np.testing.assert_array_equal(content["joints_m"][7], content["joints_m"][6])
-    assert content["lost"][2].tolist() == [False, True]
-
-
-def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
-    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
-        default_hand_shape(0.17 + slot / 100).of_side(("left", "right")[slot]).save(tmp_path / name)
-    summary = write_slots(tmp_path, two_hands())
-    assert (summary["frames"], summary["lost_frames"]) == (FRAMES, 0)
-    first, second = summary["slots"]
-    assert (first["frames"], second["frames"]) == (FRAMES, FRAMES - 3)
-    assert (first["lost_frames"], second["lost_frames"]) == (0, 1)
-    assert (first["mean_score"], second["mean_score"]) == pytest.approx((0.5, 0.75))
-    assert [one["hand"]["side"] for one in (first, second)] == ["left", "right"]
-    assert second["hand"]["length_mm"] == pytest.approx(180)
-    assert "slot 1" in metrics_table(summary)
-
-
 def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
     known = two_truths()
     metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
@@ -573,18 +506,3 @@ def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path)
     assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
     table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
     assert "the other hand" in table and table.count("usable") == 2
-
-
-def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
-    summary = write_slots(tmp_path, two_hands(), replace(two_truths(), other=None))
-    assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
-    assert summary["metrics"]["ghost_pct"] == 100
-    assert "another hand, where is none" in metrics_table(summary)
-
-
-def test_a_slot_that_there_is_not_is_a_damaged_line(tmp_path: Path) -> None:
-    write_slots(tmp_path, two_hands())
-    path = tmp_path / "track.jsonl"
-    path.write_text(path.read_text().replace('"slot":1', '"slot":7'))
-    with pytest.raises(ToftrackError, match="not a line of a run"):
-        recover(tmp_path)

@@ -143,14 +143,6 @@ def test_what_was_before_a_loss_does_not_pull_at_what_comes_after(name: str) -> 
     assert np.allclose(found[6].joints_m, raw[6].joints_m, atol=1e-6)
 
 
-def test_no_estimate_passes_and_is_forgotten() -> None:
-    nothing = no_estimate(0, 0.0, "lost", 4, 0.0)
-    nan = replace(nothing, state_name="tracking", lost=False, timestamp_s=0.12)
-    raw = [nothing, *trembling(2)[1:], nan, estimate(REST, 0.16)]
-    found = filtered(raw)
-    assert found[0] is raw[0] and found[2] is raw[2] and found[3] is raw[3]
-
-
 def test_time_that_stands_still_or_goes_back_starts_anew() -> None:
     for time_s in (0.04, 0.0):
         raw = [estimate(REST), estimate(REST, 0.04), estimate(REST + 0.1, time_s)]

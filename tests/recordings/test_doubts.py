@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from toftrack.api import make_device, make_hands_tracker
+from toftrack.api import make_device
 from toftrack.devices.replay import Folder, Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import checked_image
-from toftrack.output.advice import Watch
-from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.recordings.doubts import (
     centre_doubt,
     gaps_doubt,
@@ -26,8 +23,6 @@ from toftrack.recordings.doubts import (
 
 K = np.array([[200.0, 0, 88], [0, 200, 72], [0, 0, 1]])
 TIMES = np.array([0, 0.033, 0.067, 0.1, 0.133, 0.5])
-DATA = Path(__file__).parents[3] / "shared" / "data"
-FOLDERS = ("crowd", "grasps", "mesh-hand", "real")
 
 
 @pytest.mark.parametrize(
@@ -150,21 +145,3 @@ def test_doubts_reach_the_log_and_whoever_asks_the_device(
     caplog.clear()
     with make_device("device=sample") as sample:
         assert sample.description["doubts"] == [] and not caplog.messages
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("folder", FOLDERS)
-def test_no_recording_at_hand_is_doubted(folder: str) -> None:
-    """Of those that lie beside the checkout; of others nothing can be said here."""
-    for path in sorted((DATA / folder).glob("*.npz")):
-        device = Replay(path)
-        assert device.description["doubts"] == [], path.name
-        side = device.metadata.get("side", "right" if folder == "mesh-hand" else "auto")
-        tracker, watch = make_hands_tracker(f"hand.side={side}"), Watch(math.inf)
-        for frame in device:
-            depth = device.camera.rectify(frame.depth, frame.radial)
-            made = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-            watch.see(made, depth, tracker.insights)
-        k, (apparent_m,) = device.camera.K, watch.apparent_m()
-        assert length_doubt(tracker.fitted[0], k) == "", path.name
-        assert apparent_m is None or apparent_doubt(apparent_m, k) == "", path.name

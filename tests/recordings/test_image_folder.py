@@ -24,7 +24,7 @@ from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import read_run
 from toftrack.programs import convert
 from toftrack.programs.main import main
-from toftrack.recordings import image_folder, images
+from toftrack.recordings import image_folder
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.image_folder import read_image_folder
 from toftrack.recordings.images import decoded_png
@@ -67,18 +67,6 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     footage = run.footage()
     assert footage is not None, "figures are drawn with the same lens"
     np.testing.assert_array_equal(footage.camera.K, K)
-
-
-def test_the_lens_of_any_recording_can_be_given(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    depth = np.random.default_rng(0).uniform(0.4, 2, (2, 144, 176)).astype(np.float32)
-    np.savez(path, depth_m=depth, K=np.array(K) * 2 - np.diag([0, 0, 1]), distortion=[0.1, 0, 0, 0])
-    camera = Replay(path, intrinsics=[201, 202, 87, 71]).camera
-    np.testing.assert_array_equal(camera.K, K)
-    assert not camera.distortion.any()
-    np.save(tmp_path / "b.npy", depth)
-    with make_device("device=replay", f"device.path={tmp_path / 'b.npy'}", LENS) as device:
-        np.testing.assert_array_equal(device.camera.K, K)
 
 
 @pytest.mark.parametrize("given", ["[200,200,88]", "[-1,200,88,72]", "200", "[1,1,88,72]"])
@@ -258,15 +246,6 @@ def test_names_of_others_do_not_command_the_terminal(tmp_path: Path) -> None:
     with pytest.raises(ToftrackError) as caught:
         read_image_folder(path, bare=GIVEN)
     assert str(caught.value).isprintable()
-
-
-def test_an_exr_with_more_in_it_than_an_image_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(images, "LARGEST_PIXELS", 2 * DEPTH[0].size)
-    read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A")}, False), bare=GIVEN)
-    with pytest.raises(ToftrackError, match="larger than any camera's"):
-        read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A B")}, False), bare=GIVEN)
 
 
 def test_an_exr_that_is_damaged_is_read_or_told(tmp_path: Path) -> None:

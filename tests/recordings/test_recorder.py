@@ -275,16 +275,6 @@ def test_times_never_go_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_recording(tmp_path / "hand.npz").timestamp_s, expected)
 
 
-def test_another_unit_is_reported_at_the_beginning(tmp_path: Path) -> None:
-    for name, depth in (("a", words(0)), ("b", words(0).astype(np.float32))):
-        frames = [one_frame(depth=depth)] * module._STRANGE
-        recorder = recorded(tmp_path / f"{name}.npz", *frames)
-        assert recorder.failed and "plainly millimetres" in (recorder.ended or "")
-    good = [one_frame(), *frames]  # a camera may begin with nonsense, and have some later
-    assert not recorded(tmp_path / "c.npz", *good).failed
-    assert not recorded(tmp_path / "d.npz", *frames[1:], *good).failed
-
-
 def test_frames_that_do_not_fit_those_before_end_it(tmp_path: Path) -> None:
     small = {"depth": np.ones((HEIGHT, 7), np.float32)}
     for number, other in enumerate((small, {"radial": True}, {"amplitude": np.ones((3, 3))})):
@@ -292,13 +282,6 @@ def test_frames_that_do_not_fit_those_before_end_it(tmp_path: Path) -> None:
         recorder = recorded(path, one_frame(), one_frame(**other), one_frame())
         assert recorder.failed and "frame 0" in (recorder.ended or "")
         assert len(read_recording(path)) == 1
-
-
-def test_an_amplitude_that_is_missing_is_black(tmp_path: Path) -> None:
-    recorded(tmp_path / "hand.npz", one_frame(), one_frame(amplitude=None))
-    assert not read_recording(tmp_path / "hand.npz").amplitude[1].any()
-    recorded(tmp_path / "none.npz", one_frame(amplitude=None), one_frame())
-    assert read_recording(tmp_path / "none.npz").amplitude is None
 
 
 def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
@@ -327,13 +310,3 @@ def test_a_live_run_does_not_wait_for_the_disk(
     assert recorder.missed >= many - module._WAITING - 1
     assert recorder.frames + recorder.missed == many
     assert f"{recorder.missed} more came too fast" in recorder.words()
-
-
-def test_a_recording_that_could_not_take_its_place_does_not_begin(tmp_path: Path) -> None:
-    (tmp_path / "mine").write_text("mine")
-    (tmp_path / "hand.npz").symlink_to(tmp_path / "mine")
-    (tmp_path / "folder.npz").mkdir()
-    for name in ("hand.npz", "folder.npz"):
-        with pytest.raises(ToftrackError, match="choose another place"):
-            Recorder(tmp_path / name, Images(), 1.0, overwrite=True)
-    assert (tmp_path / "mine").read_text() == "mine" and not list(tmp_path.glob("*.part"))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import shutil
 import struct
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -152,16 +151,6 @@ def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> Non
         Bag(path, topic="/nowhere")
 
 
-def test_depth_that_was_recorded_twice_is_one_topic(tmp_path: Path) -> None:
-    twice = [
-        Message(f"{DEPTH}/compressedDepth", COMPRESSED, compressed(frame), recorded_ns(n))
-        for n, frame in enumerate(some_depth())
-    ]
-    path = write_bag(tmp_path, "bag", [*recording(some_depth(), CAMERA), *twice])
-    assert read_rosbag(path).metadata["topic"] == DEPTH
-    assert read_rosbag(path, f"{DEPTH}/compressedDepth").image(3)[0].shape == (24, 32)
-
-
 @pytest.mark.parametrize(
     ("messages", "words"),
     [
@@ -182,17 +171,6 @@ def test_bags_without_depth_are_reported(
     path = write_bag(tmp_path, "bag", messages)
     with pytest.raises(ToftrackError, match=words):
         read_rosbag(path)
-
-
-def test_images_of_another_unit_and_another_size_are_reported(tmp_path: Path) -> None:
-    depth = some_depth()
-    path = write_bag(tmp_path, "bag", recording(1000 * depth, CAMERA, "32FC1"))
-    with pytest.raises(ToftrackError, match="plainly another unit"):
-        read_rosbag(path)
-    messages = recording(depth, CAMERA)
-    messages[4].fields = image(depth[0, :, :16])
-    with pytest.raises(ToftrackError, match="frame 3 of.*16x24 pixels.*32x24"):
-        list(Bag(write_bag(tmp_path, "mcap", messages)))
 
 
 def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,22 +217,6 @@ def test_quantised_inverse_depth_is_exact_to_its_steps(packed: str) -> None:
     # A step of 1 / z is 1 / 10100 m.
     np.testing.assert_array_less(np.abs(found - depth), depth**2 / 10100 / 2 + 1e-5)
     assert (found[:3] == 0).all()
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda f: f | {"format": "16UC1; jpeg compressed bgr8"}, "not depth"),
-        (lambda f: f | {"data": f["data"][:40]}, "PNG is damaged"),
-        (lambda f: f | {"format": "32FC1; compressedDepth png"}, "make no sense"),
-    ],
-)
-def test_compressed_images_of_another_kind_are_reported(
-    change: Callable[[dict], dict], words: str
-) -> None:
-    message = as_message(change(compressed(some_depth(1)[0])))
-    with pytest.raises(ToftrackError, match=words):
-        ros_messages.depth_image(message, COMPRESSED, 0.001)
 
 
 def test_an_image_with_too_few_bytes_is_reported() -> None:

@@ -17,7 +17,6 @@ from helpers.damage import damaged
 from scipy.io import savemat
 
 from toftrack.api import make_device
-from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert
 from toftrack.recordings import matlab, stacks
@@ -147,14 +146,6 @@ def test_dataset_unit_and_rate_are_given_on_the_command_line(tmp_path: Path) -> 
     out, numbers = str(tmp_path / "out.npz"), "40 40 15.5 11.5".split()
     convert.main([str(path), out, "--dataset", "depth", "--intrinsics", *numbers])
     np.testing.assert_allclose(read_recording(out).image(2)[0], METRES[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("given", [{"unit_m": 0.002}, {"fps": 7}, {"dataset": "depth"}])
-def test_what_a_recording_says_itself_is_not_given(tmp_path: Path, given: dict[str, Any]) -> None:
-    path = tmp_path / "a.npz"
-    np.savez(path, depth_m=METRES, K=np.diag((40, 40, 1)))
-    with pytest.raises(ToftrackError, match=f"leave device.{next(iter(given))} out"):
-        Replay(path, **given)
 
 
 def directory(width: int, height: int, following: int = 0, tile: int = 0) -> bytes:

@@ -75,14 +75,6 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
     assert (camera.width, camera.height) == size
 
 
-def test_missing_infrared_is_black(tmp_path: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
-    path = write_kinect(tmp_path / "a.mkv", images[0], images[1][:5], ABOUT)
-    frames = list(Replay(path))
-    assert frames[4].amplitude.any() and not frames[6].amplitude.any()
-    path = write_kinect(tmp_path / "b.mkv", images[0], None, ABOUT)
-    assert next(iter(Replay(path))).amplitude is None
-
-
 @pytest.mark.parametrize("share", [0.001, 0.5, 0.95])
 def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_reported(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
@@ -124,16 +116,6 @@ def test_a_calibration_that_tells_no_lens_is_reported(
         Replay(path)
     Camera(K, 320, 288).save(tmp_path / "camera.json")
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 252
-
-
-def test_a_kinects_recording_without_depth_and_of_no_mode_are_reported(tmp_path: Path) -> None:
-    ones = np.ones((1, 288, 320), np.uint16)
-    path = write_kinect(tmp_path / "a.mkv", ones, about=ABOUT, titles=("COLOR", "IR"))
-    with pytest.raises(ToftrackError, match="Azure Kinect without depth"):
-        Replay(path)
-    path = write_kinect(tmp_path / "b.mkv", ones[:, :280], about=ABOUT)
-    with pytest.raises(ToftrackError, match="320x280 pixels, which is no mode"):
-        Replay(path)
 
 
 # Videos and stacks that say nothing of themselves.

@@ -94,13 +94,6 @@ def test_pictures_follow_one_another_and_none_comes_twice(view, visitor) -> None
         assert other.picture()[1] == bodies[-1]
 
 
-def test_a_frame_without_a_hand_is_shown_as_lost(view, visitor) -> None:
-    moment = moments()[0]
-    view.show(with_hand(moment, estimate=no_estimate(7, 0.28, "lost", 4, 0.01), insight=None))
-    facts, _ = visitor.picture()
-    assert facts["lost"] and facts["index"] == 7 and facts["gesture_probability"] is None
-
-
 def test_two_hands_are_distinguished_from_the_frame(view, visitor) -> None:
     moment = two_hands(moments()[1], lost=True, gesture="fist")
     view.show(moment)

@@ -29,9 +29,9 @@ from helpers.browsing import (
 from helpers.moments import two_hands, with_hand
 from helpers.programs import QUICK, interrupted_when
 from helpers.settings import browser_view
-from helpers.tracking import ROOT, configuration
+from helpers.tracking import configuration
 
-from toftrack.devices.replay import Replay, Sample
+from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import no_estimate
 from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser
@@ -85,15 +85,6 @@ def test_a_repeated_recording_counts_on(realtime: bool, clock) -> None:
         assert np.array_equal(frame.depth, later.depth)
     assert not np.array_equal(frames[0].depth, frames[1].depth)
     assert device.dropped == 0 and clock[0] == pytest.approx(7 / 25 if realtime else 0, abs=1e-3)
-
-
-def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(clock) -> None:
-    device = Replay(ROOT / "toftrack/data/sample.npz", 0, 5, realtime=True, repeat=True)
-    indices = []
-    for frame in islice(device, 4):
-        indices.append(frame.index)
-        clock[0] = round(clock[0] + 0.1201, 4)  # three frames' time
-    assert indices == [0, 1, 4, 7] and device.dropped == 4  # the first one is waited for
 
 
 def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path, monkeypatch) -> None:

@@ -202,21 +202,3 @@ def test_what_cannot_be_labelled_is_one_sentence(words, reported, tmp_path, monk
     given = [own if word == "OWN" else word for word in words]
     with pytest.raises(ToftrackError, match=re.escape(reported)):
         label.main([*given, "--no-browser"])
-
-
-def test_a_port_that_is_taken_is_named_as_it_is_given(page, tmp_path) -> None:
-    port = int(page.address.split(":")[2].partition("/")[0])
-    with pytest.raises(ToftrackError, match=f"port {port} .* is taken.* --port PORT"):
-        LabelPage(page.labels, (), (), port)
-
-
-def test_the_end_says_how_other_recordings_become_what_is_measured(tmp_path) -> None:
-    labels = LabelFile(tmp_path / "labels.json", "a", (4, 3), 9, "left")
-    assert label.ending(labels, Path("a"), []) == "nothing was labelled"
-    labels.begin([1])
-    words = ["device=folder", "device.intrinsics=[200,200,87,71]", "hand.side=left"]
-    found = label.ending(labels, Path("in/a"), words).splitlines()
-    assert found[1:] == [
-        "make an .npz of it: toftrack convert in/a a_to_measure.npz --intrinsics 200 200 87 71",
-        f"measure the tracker: toftrack benchmark accuracy a_to_measure.npz --labels {labels.path}",
-    ]

@@ -11,18 +11,15 @@ import numpy as np
 import pytest
 from helpers.videos import video_frames
 
-from toftrack.errors import MOST_HANDS, ToftrackError
+from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.views.overlay import (
     CAPTION_PX,
     VideoView,
-    caption_px,
     draw_panel,
-    film_tile,
-    filmstrip,
 )
-from toftrack.views.skeleton import FINGER_RGB, SLOT_RGB
+from toftrack.views.skeleton import SLOT_RGB
 
 W, H = 176, 144
 CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), W, H)
@@ -104,26 +101,6 @@ def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
     assert (right[300, 300] == 255).all()
 
 
-def test_each_of_eight_hands_has_its_colour_and_its_label() -> None:
-    assert len(set(SLOT_RGB)) == MOST_HANDS and not set(SLOT_RGB) & set(FINGER_RGB)
-    estimates = tuple(present() for _ in range(MOST_HANDS))
-    caption = draw_panel(DEPTH, AMPLITUDE, CAMERA, estimates, [None] * MOST_HANDS, 3)
-    caption, rest = np.split(caption, [caption_px(MOST_HANDS)])
-    assert len(rest) == 3 * H
-    for rgb in SLOT_RGB:  # all at one place, so that their labels are moved apart
-        assert colour_share(caption, rgb[::-1]) > 5e-4 and colour_share(rest, rgb[::-1]) > 1e-4
-    assert len(draw_panel(DEPTH, AMPLITUDE, CAMERA, estimates[:3], [None] * 3, 3)) == (
-        caption_px(4) + 3 * H
-    )
-
-
-def test_a_slot_without_a_hand_is_not_drawn_and_not_called_lost() -> None:
-    caption, left, _ = two(present(), lost_hand())
-    assert colour_share(left, SLOT_RGB[1][::-1]) == 0 < colour_share(left, SLOT_RGB[0][::-1])
-    assert colour_share(caption, (40, 40, 220)) == 0
-    assert colour_share(two(lost_hand(), lost_hand())[0], (40, 40, 220)) > 0.5
-
-
 @pytest.mark.parametrize("amplitude", [AMPLITUDE, None])
 def test_each_joint_is_drawn_in_its_fingers_colour(amplitude: np.ndarray | None) -> None:
     one = hand()
@@ -180,35 +157,6 @@ def test_lost_is_red_and_tracking_is_not() -> None:
         assert (colour_share(right[:, -3:], red) > 0.9) == lost
 
 
-LONG = {"gesture": "pointing_thumb", "pinching": True, "confidence": 0.99, "index": 12345}
-REPORTED: dict[str, tuple[Estimate, ...]] = {
-    "tracking": (dataclasses.replace(hand(), **LONG),),
-    "searching": (dataclasses.replace(lost_hand(), state_name="searching", index=12345),),
-    "doubted": (dataclasses.replace(hand(lost=True), **LONG),),
-    "two": (present(**LONG, side_probability=0.5), other_hand(**LONG)),
-    "one of two": (present(lost=True), lost_hand()),
-}
-
-
-@pytest.mark.parametrize("reported", REPORTED.values(), ids=REPORTED)
-def test_captions_can_be_read_in_a_filmstrip_of_1280_px(reported: tuple[Estimate, ...]) -> None:
-    panel = draw_panel(DEPTH, AMPLITUDE, CAMERA, reported, (None,) * len(reported), 3)
-    strip = filmstrip([film_tile(panel)] * 10)
-    small = cv2.resize(strip, (1280, round(strip.shape[0] * 1280 / strip.shape[1])))
-    scale = small.shape[1] / strip.shape[1]
-    tile_px, gap = 320 * scale, 8 * scale
-    body = round(film_tile(panel).shape[0] * scale / 2)
-    for top in (gap, gap + body):
-        caption = small[round(top) + 1 :, round(gap) + 1 : round(gap + tile_px) - 1]
-        caption = caption[: round(CAPTION_PX / (3 * W) * tile_px) - 2].min(-1) > 150
-        if len(reported) > 1:
-            caption[:, :18] = False  # the slot's mark
-        rows, columns = np.flatnonzero(caption.any(1)), np.flatnonzero(caption.any(0))
-        assert rows[-1] - rows[0] + 1 >= 9
-        assert rows[0] > 0
-        assert columns[-1] < caption.shape[1] - 1
-
-
 def panel_of(value: int, size: tuple[int, int] = (CAPTION_PX + 50, 160)) -> np.ndarray:
     return np.full((*size, 3), value, np.uint8)
 
@@ -249,11 +197,6 @@ def test_filmstrip_is_ten_evenly_spread_panels(tmp_path: Path, count: int, known
         for column in range(5)
     ]
     np.testing.assert_allclose(shown, np.linspace(0, count - 1, 10), atol=0.035 * count + 0.6)
-
-
-def test_nothing_is_written_without_a_panel(tmp_path: Path) -> None:
-    VideoView(tmp_path, 25, 10).close()
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_video_that_cannot_be_written_is_reported(tmp_path: Path) -> None:

@@ -148,19 +148,6 @@ def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
     assert 7 not in labels and 7 not in segments  # nothing in range: cleared
 
 
-def test_particles_lie_around_the_hand_brighter_with_weight(written: Path) -> None:
-    places = rows(written, "world/hand/particles", "Points3D:positions")
-    colours = rows(written, "world/hand/particles", "Points3D:colors")
-    for moment in moments()[1:FRAMES]:
-        number = moment.estimates[0].index
-        weights = moment.hands[0].insight.weights.numpy()
-        middle = weights @ places[number]
-        assert np.linalg.norm(middle - moment.estimates[0].joints_m.mean(0)) < 0.05
-        red = (colours[number] >> 24) & 255  # grows all along the colour map
-        assert red[weights.argmax()] == red.max() and red[weights.argmin()] == red.min()
-        assert len(set(red)) > 3
-
-
 def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> None:
     """It goes after the first frame."""
     both = two_hands(moments()[5])

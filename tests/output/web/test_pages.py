@@ -258,15 +258,6 @@ def test_the_docs_client_draws_the_hand_live_and_bends_it(
     assert logged == []
 
 
-def test_a_ray_away_from_the_screen_moves_no_cursor(stream: Any, page: Any) -> None:
-    page.get(f"{stream.url}point?seed=3")
-    away = {"pointing_origin_m": np.array([0, 0, 0.5]), "pointing_direction": np.array([0, -1, 0])}
-    estimate = replace(hand_estimate(1), gesture="pointing", **away)
-    shown(page, "game.index === 1", lambda: stream.send((estimate,)))
-    assert page.execute_script("return game.cursor") is None
-    assert not page.find_element("id", "cursor").is_displayed()
-
-
 def test_the_pages_say_when_the_tracker_has_gone(browser: Any, tmp_path: Path) -> None:
     with part("stream=websocket", "stream", port=0) as stream:
         browser.get(stream.url)

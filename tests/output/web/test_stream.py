@@ -7,10 +7,9 @@ import json
 import logging
 import re
 import socket
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
@@ -23,7 +22,7 @@ from websockets.sync import client
 
 from toftrack.errors import ToftrackError
 from toftrack.output.lines import json_line
-from toftrack.output.web.server import MOST_HALF_OPEN, Client
+from toftrack.output.web.server import MOST_HALF_OPEN
 from toftrack.output.web.stream import WebSocketStream
 
 
@@ -113,15 +112,6 @@ def test_connections_that_ask_nothing_are_few_and_keep_nobody_out(
         eventually(lambda: len(stream._server._open) == 1)
 
 
-def test_connections_that_ask_nothing_do_not_hold_up_the_end() -> None:
-    with ExitStack() as stack:
-        with websocket_stream() as stream:
-            opened = [stack.enter_context(one) for one in half_open(stream, 5)]
-            eventually(lambda: len(stream._server._open) == 5)
-        assert ours() == []
-        eventually(lambda: all(map(ended, opened)))
-
-
 def listen(mute: socket.socket, stream: WebSocketStream) -> None:
     """Make a client of a socket that is never read."""
     url = urlsplit(stream.url)
@@ -165,29 +155,6 @@ def test_a_host_that_can_be_no_name_is_one_sentence_and_leaves_no_thread() -> No
     assert ours() == []
 
 
-def test_who_sends_without_end_does_not_keep_others_waiting(
-    stream: WebSocketStream, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    taken: list[object] = []
-    monkeypatch.setattr(Client, "receive", lambda _, message: taken.append(message))
-
-    def flood(loud: socket.socket) -> None:
-        with suppress(OSError):
-            while True:
-                loud.sendall((b"\x81\x80" + bytes(4)) * 4000)  # empty messages
-
-    with socket.socket() as loud:
-        listen(loud, stream)
-        sender = threading.Thread(target=flood, args=(loud,))
-        sender.start()
-        eventually(lambda: len(taken) > 50_000)  # much waits by now
-        before = len(taken)
-        assert answer(stream, "/")[0] == 200
-        assert len(taken) - before < 20_000
-        loud.shutdown(socket.SHUT_RDWR)
-        sender.join()
-
-
 @pytest.mark.parametrize(
     "headers, words",
     [
@@ -228,12 +195,6 @@ def test_the_pages_come_with_all_that_they_need(stream: WebSocketStream) -> None
         assert set(re.findall(r"src=\"([^\"]+)\"", page)) == {"/feed.js"}
         assert not re.search(r"https?://|@import|url\(", page)
     assert answer(stream, "/feed.js")[1]["Content-Type"].startswith("text/javascript")
-
-
-def test_what_is_not_there_is_refused(stream: WebSocketStream) -> None:
-    assert answer(stream, "/other")[0] == 404
-    assert answer(stream, "/stream")[0] == 426
-    assert answer(stream, "/", Host="evil.example")[0] == 403
 
 
 def test_the_last_lines_arrive_and_then_everything_ends() -> None:
