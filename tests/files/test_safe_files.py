@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from toftrack.files import safe_files
 from toftrack.files.safe_files import (
     leave_folder,
     lock_folder,
@@ -139,6 +140,15 @@ def test_a_folder_that_is_a_link_is_refused(path: Path, tmp_path: Path) -> None:
     with pytest.raises(OSError, match="symbolic link"):
         make_folder(path)
     make_folder(path.with_name("other"))
+
+
+def test_where_the_system_knows_no_such_flag_links_are_refused_all_the_same(
+    path: Path, elsewhere: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(safe_files, "_NO_LINK", 0)
+    path.symlink_to(elsewhere)
+    with pytest.raises(OSError, match="symbolic link"):
+        open_in_place(path)
 
 
 @pytest.mark.parametrize("write", [WRITERS["write_whole"], WRITERS["open_new"]])

@@ -175,6 +175,14 @@ def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
         assert set(labels) <= {"other", "pointing", first, last}
 
 
+def test_noise_leaves_a_gesture_what_it_is() -> None:
+    rng = np.random.default_rng(0)
+    for label, angles, thumbs in SHOWN[:6]:
+        for _ in range(20):
+            noisy = of_thumb(angles, thumbs[0]) + rng.normal(0, math.radians(6), 21)
+            assert label_of(noisy) == label
+
+
 def test_a_bad_score_says_nothing() -> None:
     fist, classes = seen(pose("fist")), len(GESTURES.names)
     _, _, probability = update(None, fist, 0.3, ON, GESTURES)

@@ -275,6 +275,16 @@ def test_times_never_go_back(tmp_path: Path) -> None:
     np.testing.assert_allclose(read_recording(tmp_path / "hand.npz").timestamp_s, expected)
 
 
+def test_another_unit_is_reported_at_the_beginning(tmp_path: Path) -> None:
+    for name, depth in (("a", words(0)), ("b", words(0).astype(np.float32))):
+        frames = [one_frame(depth=depth)] * module._STRANGE
+        recorder = recorded(tmp_path / f"{name}.npz", *frames)
+        assert recorder.failed and "plainly millimetres" in (recorder.ended or "")
+    good = [one_frame(), *frames]  # a camera may begin with nonsense, and have some later
+    assert not recorded(tmp_path / "c.npz", *good).failed
+    assert not recorded(tmp_path / "d.npz", *frames[1:], *good).failed
+
+
 def test_frames_that_do_not_fit_those_before_end_it(tmp_path: Path) -> None:
     small = {"depth": np.ones((HEIGHT, 7), np.float32)}
     for number, other in enumerate((small, {"radial": True}, {"amplitude": np.ones((3, 3))})):
