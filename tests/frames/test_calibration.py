@@ -149,7 +149,6 @@ def parallel(width: int, **depth: object) -> Camera:
 
 
 def rectified(camera: Camera, radial_m: np.ndarray) -> np.ndarray:
-    """(W,) of a first row (W,)."""
     return camera.rectify(np.tile(radial_m.astype(np.float32), (2000, 1)), True)[0]
 
 

@@ -244,8 +244,6 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: P
 
 
 class FullDisk:
-    """Takes so many bytes of a file."""
-
     def __init__(self, file: io.FileIO, capacity: int) -> None:
         self._file, self._capacity = file, capacity
 
@@ -299,8 +297,8 @@ def test_memory_does_not_grow_with_the_frames(
         return found
 
     one = estimate(0)
-    few, many = peak(100), peak(200)
-    assert many - few < 100 * 200  # a frame's numbers alone are 1100 bytes
+    few, many = peak(50), peak(110)
+    assert many - few < 60 * 200  # a frame's numbers alone are 1100 bytes
 
 
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:

@@ -27,9 +27,8 @@ GIVEN = BareFacts((252.0, 253.0, 166.0, 140.0))
 RANGE_M = unambiguous_range_m(20)
 
 
-def of_npz(folder: Path, words: np.ndarray) -> Path:
-    amplitude, K = words[:, ::-1], CAMERA.K
-    np.savez_compressed(folder / "a.npz", depth_m=metres(words), amplitude=amplitude, K=K)
+def of_npz(folder: Path, words: np.ndarray, save: Callable = np.savez) -> Path:
+    save(folder / "a.npz", depth_m=metres(words), amplitude=words[:, ::-1], K=CAMERA.K)
     return folder / "a.npz"
 
 
@@ -66,7 +65,7 @@ def of_bag(kind: str) -> Callable[[Path, np.ndarray], Path]:
 
 KINDS: dict[str, Callable[[Path, np.ndarray], Path]] = {
     "npz": of_npz,
-    "long npz": of_npz,
+    "long npz": lambda folder, words: of_npz(folder, words, np.savez_compressed),
     "srs": of_srs,
     "folder": of_folder,
     "npy": of_stack,

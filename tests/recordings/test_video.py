@@ -30,7 +30,6 @@ REPORTED = BareFacts((30.0, 31.0, 15.5, 11.5))
 
 
 def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
-    """(count, *size) uint16 of all values."""
     return np.random.default_rng(count).integers(0, 0x10000, (count, *size)).astype(np.uint16)
 
 

@@ -149,7 +149,6 @@ def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
 
 
 def test_the_second_hand_has_entities_of_its_own(rerun_view, tmp_path: Path) -> None:
-    """It goes after the first frame."""
     both = two_hands(moments()[5])
     with rerun_view.RerunView(tmp_path, 25.0, 2, likelihood=f_measure()) as view:
         view.show(both)

@@ -207,7 +207,8 @@ def test_the_sample_of_pointing_and_pinching_hits_every_target(stream: Any, page
         origin, way = (nowhere, nowhere) if pinch.pinching else pointing_ray(joints)
         ray = {"pointing_origin_m": origin, "pointing_direction": way}
         seen = {"index": index, "timestamp_s": index / device.fps, "pinching": pinch.pinching}
-        lines.append(json.loads(json_line([replace(hand, **seen | ray)])))
+        fields = ("lost", "gesture", "gesture_probability", "pinch", *seen, *ray)
+        lines.append(json.loads(json_line([replace(hand, **seen | ray)], fields)))
     page.get(f"{stream.url}{GAME}")
     game = page.execute_script(PLAY, lines)
     assert (game["hits"], game["misses"], game["over"]) == (12, 0, True)

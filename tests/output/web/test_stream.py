@@ -46,7 +46,6 @@ def listening(stream: WebSocketStream, **headers: str) -> Any:
 
 
 def index_of(one: Any) -> int:
-    """Of the next line that a client gets."""
     return json.loads(one.recv(PATIENCE_S))["index"]
 
 
