@@ -208,3 +208,14 @@ def test_a_missing_or_old_sdk_is_reported_with_the_extra(
             realsense()
         with pytest.raises(ToftrackError, match="ROS topics goes without: toftrack track FILE"):
             realsense(bag=tmp_path / "a.bag")
+
+
+def test_a_recording_at_its_own_pace_drops_what_comes_too_late(recording: Path) -> None:
+    device = realsense(bag=recording, realtime=True)
+    indices = []
+    for frame in device:
+        indices.append(frame.index)
+        time.sleep(0.05)
+    assert indices == sorted(set(indices))
+    assert 5 < len(indices) < 60
+    assert device.dropped > 30

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from toftrack.files import archives
 from toftrack.files.archives import (
+    MOST_TEXT_BYTES,
+    Archive,
     PickledError,
     Pieces,
     read_archive,
@@ -83,15 +86,15 @@ def test_arrays_of_every_kind_are_read_as_numpy_does(tmp_path: Path, method: int
 
 
 def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path) -> None:
-    shape = (80, 2**20 // 4)
-    path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 80]}, DEFLATED)
+    shape = (128, 2**20 // 4)
+    path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 128]}, DEFLATED)
     assert path.stat().st_size < 2**20
-    assert "'a': it would make 84 MB of" in reported(path)
+    assert "'a': it would make 134 MB of" in reported(path)
 
 
 def with_more_than_stated(path: Path, method: int) -> Path:
     """The stated size and the header agree, but much more comes."""
-    save(path, {"a": [header((1000,)), *[ZEROS] * 32]}, method)
+    save(path, {"a": [header((1000,)), *[ZEROS] * 128]}, method)
     forged = bytearray(path.read_bytes())
     size = struct.pack("<I", len(header((1000,))) + 4000)
     at = forged.index(b"PK\x01\x02")
@@ -129,8 +132,8 @@ def test_a_header_that_claims_too_much_is_not_believed(tmp_path: Path, method: i
 
 
 def test_a_header_without_end_is_not_read(tmp_path: Path) -> None:
-    long = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**25)
-    path = save(tmp_path / "a.npz", {"a": [long, *[b" " * 2**20] * 32]}, DEFLATED)
+    long = b"\x93NUMPY\x02\x00" + struct.pack("<I", 2**27)
+    path = save(tmp_path / "a.npz", {"a": [long, *[b" " * 2**20] * 128]}, DEFLATED)
     assert "'a': its header is damaged" in reported(path)
 
 
@@ -145,6 +148,7 @@ def edited(old: bytes, new: bytes) -> Callable[[bytes], bytes]:
         (edited(b"{'descr': '<f8', 'fortran_order'", b"(" * 32), "'a'"),
         (edited(b"'<f8'", b"'z9'"), "'a'"),
         (edited(b"NUMPY\x01", b"NUMPY\x07"), "it is no array"),
+        (edited(b"NUMPY\x01", b"NUMB3\x01"), "it is no array"),
         (lambda content: content[:60], "'a'"),
     ],
 )
@@ -159,6 +163,44 @@ def test_objects_are_refused(tmp_path: Path) -> None:
         read_archive(tmp_path / "a.npz")
 
 
+def test_a_text_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    length = MOST_TEXT_BYTES // 4 + 1
+    pieces = [header((), f"<U{length}"), *[ZEROS] * 16, bytes(4)]
+    path = save(tmp_path / "a.npz", {"a": pieces}, DEFLATED)
+    assert "'a': it is a text of 17 MB" in reported(path)
+
+
+def test_an_array_beyond_the_cap_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(archives, "MOST_BYTES", 1000)
+    path = save(tmp_path / "a.npz", {n: npy(np.ones(100)) for n in "ab"}, STORED)
+    assert "it is larger than" in reported(path)
+    with open(path, "rb") as stream, pytest.raises(ValueError, match="at most"):
+        Archive(stream).read("a", 100)
+
+
+def test_other_compressions_are_refused(tmp_path: Path) -> None:
+    path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
+    assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
+
+
+def test_what_is_much_larger_than_the_directory_says_is_not_unpacked(
+    tmp_path: Path,
+) -> None:
+    path = save(tmp_path / "a.npz", {"a": [header((2**26,), "<u1"), *[ZEROS] * 64]}, BZIP2)
+    whole = path.read_bytes()
+    size = struct.pack("<I", 2**26 + len(header((2**26,), "<u1")))
+    assert size in whole
+    small = npy(np.zeros(1000, np.uint8))
+    path.write_bytes(whole.replace(size, struct.pack("<I", len(small))))
+    tracemalloc.start()
+    with pytest.raises(ValueError, match="'a': it is of another length"):
+        read_archive(path)
+    assert tracemalloc.get_traced_memory()[1] < 1e7
+    tracemalloc.stop()
+
+
 @every_method
 def test_random_damage_never_ends_otherwise_than_with_a_value_error(
     tmp_path: Path, method: int
@@ -167,7 +209,7 @@ def test_random_damage_never_ends_otherwise_than_with_a_value_error(
     content = {"a": npy(rng.integers(0, 9, (40, 50))), "b": npy(np.array("text"))}
     whole = save(path, content, method).read_bytes()
     refused = 0
-    for _ in range(60):
+    for _ in range(150):
         damaged = bytearray(whole)
         for at in rng.integers(0, len(whole), rng.integers(1, 6)):
             damaged[at] = rng.integers(0, 256)
@@ -177,4 +219,14 @@ def test_random_damage_never_ends_otherwise_than_with_a_value_error(
         except ValueError as error:
             refused += 1
             assert "\n" not in str(error)
-    assert refused > 30
+    assert refused > 75
+
+
+@pytest.mark.parametrize("kind", ["<U2", ">U2"])
+def test_characters_that_are_none_are_reported(kind: str, tmp_path: Path) -> None:
+    whole = np.array(["a", "\U0010ffff"], kind)
+    path = save(tmp_path / "a.npz", {"a": npy(whole)}, STORED)
+    assert read_archive(path)["a"].tolist() == whole.tolist()
+    broken = npy(whole)[:-4] + b"\x7f\x7f\x7f\x7f"
+    path = save(tmp_path / "b.npz", {"a": broken}, STORED)
+    assert "text is damaged" in reported(path)

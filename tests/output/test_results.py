@@ -23,6 +23,7 @@ from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
 from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.frames.frame import Truth
+from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output import records
 from toftrack.output.lines import (
@@ -504,3 +505,38 @@ def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path)
     assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
     table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
     assert "the other hand" in table and table.count("usable") == 2
+
+
+def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
+    writer = ResultWriter(tmp_path, {}, NAMES, None)
+    writer.append((estimate(0),))
+    (tmp_path / "track.npz").mkdir()
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        writer.close()
+    assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
+
+
+def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
+    write_slots(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)])
+    content = read_results(tmp_path / "track.npz")
+    assert content["metadata"]["held_frames"] == [2, 7]
+    assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
+    there = content["state_name"] != ""  # a slot without a hand says nothing
+    assert ((content["state_name"] == "dropped") == content["dropped"][:, None] & there).all()
+    assert there[2].tolist() == [True, False]
+    np.testing.assert_array_equal(content["joints_m"][7], content["joints_m"][6])
+    assert content["lost"][2].tolist() == [False, True]
+
+
+def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
+    for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
+        default_hand_shape(0.17 + slot / 100).of_side(("left", "right")[slot]).save(tmp_path / name)
+    summary = write_slots(tmp_path, two_hands())
+    assert (summary["frames"], summary["lost_frames"]) == (FRAMES, 0)
+    first, second = summary["slots"]
+    assert (first["frames"], second["frames"]) == (FRAMES, FRAMES - 3)
+    assert (first["lost_frames"], second["lost_frames"]) == (0, 1)
+    assert (first["mean_score"], second["mean_score"]) == pytest.approx((0.5, 0.75))
+    assert [one["hand"]["side"] for one in (first, second)] == ["left", "right"]
+    assert second["hand"]["length_mm"] == pytest.approx(180)
+    assert "slot 1" in metrics_table(summary)

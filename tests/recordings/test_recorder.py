@@ -320,3 +320,13 @@ def test_a_live_run_does_not_wait_for_the_disk(
     assert recorder.missed >= many - module._WAITING - 1
     assert recorder.frames + recorder.missed == many
     assert f"{recorder.missed} more came too fast" in recorder.words()
+
+
+def test_a_recording_that_could_not_take_its_place_does_not_begin(tmp_path: Path) -> None:
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / "hand.npz").symlink_to(tmp_path / "mine")
+    (tmp_path / "folder.npz").mkdir()
+    for name in ("hand.npz", "folder.npz"):
+        with pytest.raises(ToftrackError, match="choose another place"):
+            Recorder(tmp_path / name, Images(), 1.0, overwrite=True)
+    assert (tmp_path / "mine").read_text() == "mine" and not list(tmp_path.glob("*.part"))
