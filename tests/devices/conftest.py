@@ -10,6 +10,5 @@ import pytest
 
 @pytest.fixture(autouse=True)
 def nothing_is_left() -> Iterator[None]:
-    """After each test: no thread."""
     yield
     assert not [t for t in threading.enumerate() if t.name == "sr3000-reader"]

@@ -68,34 +68,19 @@ def test_range_keeps_the_recordings_indices_and_its_truth(recording: Path) -> No
     assert device.truth.visible.tolist() == [True, False, True]
     assert device.truth.in_space.tolist() == [False, False, True]
     assert device.truth.visible_fraction is None
+    description = json.loads(json.dumps(device.description))
+    assert description["recording"] == str(recording)
+    assert (description["start"], description["stop"]) == (4, 7)
+    assert device.metadata == {"who": "a test"}
 
 
 @pytest.mark.parametrize(
     ("start", "stop"),
-    [(T, None), (-1, None), (0, T + 1), (5, 5), ("a", None), (True, 3)],
+    [(T, None), (-1, None), (0, T + 1), (5, 5), ("a", None)],
 )
 def test_range_outside_the_recording_is_reported(recording: Path, start: Any, stop: Any) -> None:
     with pytest.raises(ToftrackError, match=f"start|stop.*{T}"):
         Replay(recording, start=start, stop=stop)
-
-
-def test_description_is_json_and_says_what_was_replayed(recording: Path) -> None:
-    device = Replay(str(recording), start=2, stop=5)
-    description = json.loads(json.dumps(device.description))
-    assert description["recording"] == str(recording)
-    assert (description["start"], description["stop"]) == (2, 5)
-    assert device.metadata == {"who": "a test"}
-
-
-def test_realtime_waits_for_each_frames_time(recording: Path) -> None:
-    device = Replay(recording, realtime=True)
-    assert device.live
-    begin = time.monotonic()
-    indices = [frame.index for frame in device]
-    assert time.monotonic() - begin >= (T - 1) / 100
-    assert indices[0] == 0
-    assert indices[-1] == T - 1
-    assert len(indices) + device.dropped == T
 
 
 def test_realtime_drops_what_comes_too_late(
@@ -105,6 +90,7 @@ def test_realtime_drops_what_comes_too_late(
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
     monkeypatch.setattr(time, "sleep", lambda seconds: now.__setitem__(0, now[0] + seconds))
     device = Replay(recording, start=1, realtime=True)
+    assert device.live
     indices = []
     for frame in device:
         indices.append(frame.index)

@@ -15,16 +15,19 @@ from toftrack.hand.shape import HandShape
 HOSTILE = {
     "lists": ("[" * 100_000, "nested too deeply"),
     "objects": ('{"a":' * 100_000 + "1" + "}" * 100_000, "nested too deeply"),
-    "digits": ("9" * 400, "400 digits"),
-    "many digits": ("9" * 5000, "5000 digits"),
+    "digits": ("9" * 5000, "5000 digits"),
     "cut off": ('{"a": ', "Expecting value"),
 }
 
 
 @pytest.mark.parametrize(("text", "words"), HOSTILE.values(), ids=HOSTILE)
-def test_what_cannot_be_meant_is_a_value_error(text: str, words: str) -> None:
+def test_what_cannot_be_meant_is_an_error(text: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=words):
         parse_json(text)
+    (tmp_path / "hostile.json").write_text(text)
+    for load in (Camera.load, HandShape.load):
+        with pytest.raises(ToftrackError, match="hostile.json"):
+            load(tmp_path / "hostile.json")
 
 
 def test_usual_content_is_read(tmp_path: Path) -> None:
@@ -41,12 +44,3 @@ def test_a_file_that_is_too_large_is_not_parsed(
     path.write_text("1" + " " * 2**20)
     with pytest.raises(ValueError, match="larger than 1 MB"):
         read_json(path)
-
-
-@pytest.mark.parametrize("text", [text for text, _ in HOSTILE.values()], ids=HOSTILE)
-@pytest.mark.parametrize("load", [Camera.load, HandShape.load])
-def test_files_of_it_are_reported_in_one_sentence(load, text: str, tmp_path: Path) -> None:
-    path = tmp_path / "hostile.json"
-    path.write_text(text)
-    with pytest.raises(ToftrackError, match="hostile.json"):
-        load(path)

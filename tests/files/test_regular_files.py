@@ -9,7 +9,6 @@ import pytest
 from helpers.readers import write_readers
 
 from toftrack.errors import ToftrackError
-from toftrack.files.safe_files import open_to_read
 from toftrack.programs.applications import with_recording
 from toftrack.programs.report import read_runs, report
 from toftrack.recordings.store import open_recording
@@ -22,11 +21,11 @@ def test_every_reader_refuses_a_pipe_in_place_of_its_file(tmp_path: Path) -> Non
     for reader in write_readers(tmp_path, whole=False):
         if reader.name in ("config.yaml", "group: a .yaml"):  # programs, and read by Hydra
             continue
-        if reader.name == "unfinished recording":  # of which this reader makes a copy
-            continue
         reader.file.unlink()
         os.mkfifo(reader.file)
         try:
+            if reader.name == "unfinished recording":  # of which that reader makes a copy
+                recover_recording(reader.given)
             reader.read(reader.given)
         except ToftrackError as error:
             assert "\n" not in str(error), reader.name
@@ -34,16 +33,9 @@ def test_every_reader_refuses_a_pipe_in_place_of_its_file(tmp_path: Path) -> Non
             assert reader.name == "overrides.yaml"  # a job that is told to have failed
 
 
-def test_a_pipe_is_no_recording_to_recover(tmp_path: Path) -> None:
-    os.mkfifo(tmp_path / "hand.npz.part")
-    with pytest.raises(ToftrackError, match="is a pipe, and only files"):
-        recover_recording(tmp_path / "hand.npz")
-
-
-@pytest.mark.parametrize("path", ["/dev/zero", "/dev/full"])
-def test_a_device_is_no_recording(path: str) -> None:
+def test_a_device_is_no_recording() -> None:
     with pytest.raises(ToftrackError, match="is a device, and only files"):
-        open_recording(path)
+        open_recording("/dev/zero")
 
 
 def test_a_folder_with_a_pipe_is_no_bag(tmp_path: Path) -> None:
@@ -52,15 +44,6 @@ def test_a_folder_with_a_pipe_is_no_bag(tmp_path: Path) -> None:
         os.mkfifo(tmp_path / name)
     with pytest.raises(ToftrackError, match="is a pipe, and only files"):
         open_recording(tmp_path)
-
-
-def test_files_and_links_to_them_are_read(tmp_path: Path) -> None:
-    (tmp_path / "file").write_bytes(b"content")
-    (tmp_path / "link").symlink_to("file")
-    with open_to_read(tmp_path / "link") as stream:
-        assert stream.read() == b"content"
-    with pytest.raises(FileNotFoundError):
-        open_to_read(tmp_path / "none")
 
 
 def test_names_that_are_not_utf8_are_reported(

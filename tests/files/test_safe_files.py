@@ -100,8 +100,10 @@ def test_a_file_is_there_as_a_whole_or_as_it_was(path: Path) -> None:
         stream.write(b"half")
         raise RuntimeError
     assert path.read_text() == "whole" and list(path.parent.iterdir()) == [path]
+    usual = stat.S_IMODE(path.stat().st_mode)
     write_whole(path, "ä")
     assert path.read_bytes() == "ä".encode() and list(path.parent.iterdir()) == [path]
+    assert stat.S_IMODE(path.stat().st_mode) == usual
 
 
 def test_two_who_write_a_file_at_once_do_not_meet(path: Path) -> None:
@@ -109,13 +111,6 @@ def test_two_who_write_a_file_at_once_do_not_meet(path: Path) -> None:
         one.write(b"one")
         other.write(b"other")
     assert path.read_bytes() == b"one"
-
-
-def test_a_new_file_has_the_usual_permissions(path: Path) -> None:
-    path.write_text("old")
-    usual = stat.S_IMODE(path.stat().st_mode)
-    write_whole(path, "new")
-    assert stat.S_IMODE(path.stat().st_mode) == usual
 
 
 def test_what_a_killed_writer_left_can_be_removed(path: Path) -> None:
@@ -138,12 +133,6 @@ def test_a_file_that_is_there_is_only_replaced_when_asked(path: Path) -> None:
         assert stream.read() == b""
     with pytest.raises(FileNotFoundError):
         open_in_place(path.with_name("other"), make=False)
-
-
-def test_links_are_read_through(path: Path, elsewhere: Path) -> None:
-    path.symlink_to(elsewhere)
-    with open_to_read(path) as stream:
-        assert stream.read() == b"precious"
 
 
 def test_a_folder_that_is_a_link_is_refused(path: Path, tmp_path: Path) -> None:

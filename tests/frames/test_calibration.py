@@ -14,7 +14,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.frames import calibration
-from toftrack.frames.calibration import DepthPairs, View
+from toftrack.frames.calibration import View
 from toftrack.frames.camera import Camera
 from toftrack.programs import calibrate, command_line
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
@@ -149,7 +149,6 @@ def parallel(width: int, **depth: object) -> Camera:
 
 
 def rectified(camera: Camera, radial_m: np.ndarray) -> np.ndarray:
-    """(W,) of a first row (W,)."""
     return camera.rectify(np.tile(radial_m.astype(np.float32), (2000, 1)), True)[0]
 
 
@@ -189,9 +188,7 @@ def test_report_tells_before_and_after(calibrated: tuple[Camera, Path]) -> None:
     assert facts["after"]["board_rms_mm"] < 2
     assert facts["order"] in range(1, 8)
     assert facts["frames_used"] >= 20
-    text = (folder / "report.txt").read_text()
-    assert "before" in text
-    assert "depth, boards" in text
+    assert "before" in (folder / "report.txt").read_text()
     for name in ("corners.png", "depth_error.png"):
         picture = cv2.imread(str(folder / name))
         assert picture.std() > 10
@@ -201,7 +198,7 @@ def test_a_known_lens_is_kept(recording: Path, tmp_path: Path) -> None:
     TRUE.save(tmp_path / "start.json")
     out = tmp_path / "camera.json"
     calibrate.main(
-        [str(recording), "--board", "7x5", "--square", "0.03", "--keep-lens", "--frames", "14"]
+        [str(recording), "--board", "7x5", "--square", "0.03", "--keep-lens", "--frames", "10"]
         + ["--camera", str(tmp_path / "start.json"), "--out", str(out)]
     )
     camera = Camera.load(out)
@@ -238,55 +235,12 @@ def test_exact_corners_give_the_exact_lens_and_planes() -> None:
         assert np.abs(distance - radial)[on_board].max() < 0.002
 
 
-def test_a_lens_of_another_model_is_a_start_and_a_rational_one_can_be_kept() -> None:
-    rational = (0.5, -0.02, 1e-4, -1e-4, -0.003, 0.9, 0.08, -0.01)
-    starts = {"opencv": rational, "fisheye": (0.1, 0.0, 0.0, 0.0)}
-    views = exact_views(TRUE)
-    for model, coefficients in starts.items():
-        start = Camera(nominal_camera().K, 176, 144, np.array(coefficients), lens=model)
-        lens = calibration.fit_lens(views, BOARD, SQUARE_M, start)
-        np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.01)
-    wide = Camera(TRUE.K, 176, 144, np.array(rational))
-    known = calibration.known_lens(exact_views(wide), BOARD, SQUARE_M, wide)
-    assert known.errors_px.max() < 1e-2
-    np.testing.assert_array_equal(known.camera.distortion, rational)
-    with pytest.raises(ToftrackError, match="fisheye lens cannot be kept.*--keep-lens"):
-        calibration.known_lens(views, BOARD, SQUARE_M, start)
-
-
-def test_a_view_that_does_not_fit_is_left_out() -> None:
-    views = exact_views(TRUE)
-    views[3] = View(3, views[3].corners_px + np.random.default_rng(0).normal(size=(35, 2)) * 4)
-    lens = calibration.fit_lens(views, BOARD, SQUARE_M, nominal_camera())
-    assert 3 not in [view.index for view in lens.views]
-    np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.05)
-
-
-def test_the_polynomial_ignores_the_noise_of_single_pixels() -> None:
-    rng = np.random.default_rng(0)
-    view = np.repeat(np.arange(30), 400)
-    true = np.repeat(np.linspace(0.4, 1.4, 30), 400) + rng.uniform(-0.01, 0.01, len(view))
-    measured = true + 0.01 * true + rng.normal(size=len(view)) * 0.02
-    fit = calibration.fit_depth(DepthPairs(measured, true, np.ones(len(view)), view))
-    _, error = calibration.frame_errors(
-        DepthPairs(1.01 * true, true, np.ones(len(view)), view), fit.polynomial
-    )
-    assert np.abs(error).max() < 0.002
-
-
-@pytest.mark.parametrize("image", [np.zeros((144, 176)), np.full((144, 176), 900)])
-def test_no_board_no_corners(image: np.ndarray) -> None:
-    assert calibration.find_corners(image.astype(np.uint16), BOARD) is None
-
-
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (["--board", "7", "--square", "0.03"], "COLUMNSxROWS"),
-        (["--board", "2x5", "--square", "0.03"], "3 to 50"),
         (["--board", "7x5", "--square", "30"], "metres"),
         (["--board", "9x6", "--square", "0.03", "--frames", "3"], "no 9x6 chequerboard"),
-        (["--board", "7x5", "--square", "0.03", "--camera", "nope.json"], "nope.json"),
     ],
 )
 def test_errors_are_one_sentence(
@@ -309,10 +263,3 @@ def test_a_recording_without_amplitude_is_reported(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", depth_m=np.ones((2, 6, 8), np.float32), K=np.diag((9.0, 9, 1)))
     with pytest.raises(ToftrackError, match="no amplitude"):
         calibrate.main([str(tmp_path / "a.npz"), "--board", "7x5", "--square", "0.03"])
-
-
-def test_boards_at_one_distance_are_reported() -> None:
-    view = np.repeat(np.arange(9), 50)
-    pairs = DepthPairs(np.full(450, 0.8), np.full(450, 0.81), np.ones(450), view)
-    with pytest.raises(ToftrackError, match="near and far"):
-        calibration.fit_depth(pairs)

@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.settings import gestures, part
-from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose, seen
+from helpers.shown_gestures import fingers, label_of, pose
 
 from toftrack.errors import ToftrackError
 from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
-from toftrack.gestures.recognition import gestures_with
 from toftrack.hand.skeleton import ANGLE_NAMES
 
 PAPER = part("gestures=paper", "gestures")
@@ -101,19 +100,6 @@ def test_poses_are_read_as_they_were_saved(tmp_path: Path) -> None:
         save_poses(tmp_path / "none" / "mine.json", saved)
 
 
-def test_a_gesture_that_was_seen_to_vary_forgives_more() -> None:
-    spread = np.zeros(21)
-    spread[[18, 19]] = math.radians(40)  # the little finger's knuckle and middle joint
-    far = fingers(1, 2)
-    far[[18, 19]] = math.radians(80)
-    chances = []
-    for varied in (np.zeros(21), spread):
-        named = [NamedPose("rock", fingers(1, 2), varied)]
-        mine = gestures_with("all", named, GESTURES.settings, "here")
-        chances.append(mine.probabilities(seen(far), SURE, ON)[mine.names.index("rock")])
-    assert chances[1] > 2 * chances[0]
-
-
 @pytest.mark.parametrize(
     ("poses", "units", "words"),
     [
@@ -121,9 +107,7 @@ def test_a_gesture_that_was_seen_to_vary_forgives_more() -> None:
         ([{"name": "v", "angles": ROCK}], "radians", "if they are degrees"),
         ([{"angles": ROCK}], "degrees", "pose 1 has no name"),
         ([{"name": "v", "angles": {"index_flexion": 9}}], "degrees", "unknown angle"),
-        ([{"name": "v", "angles": {"index_mcp_flexion": -80}}], "degrees", "joint limits"),
         ([{"name": "other", "angles": ROCK}], "degrees", "none of the classes"),
-        ([{"name": n, "angles": ROCK} for n in "ab"], "degrees", "too much alike"),
         ([{"name": "v", "angles": ROCK, "spread": [-1] * 21}], "degrees", "a spread below 0"),
     ],
 )
@@ -136,27 +120,19 @@ def test_bad_json_is_reported_in_one_sentence(
     assert words in str(caught.value) and "mine.json" in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+def test_a_bad_csv_and_a_file_that_is_none_are_reported(tmp_path: Path) -> None:
+    for text, words in (
         ("# units: degrees\nindex_mcp_flexion\n80\n", "no column 'name'"),
         ("# units: degrees\nname,index_mcp_flexion\nv\n", "1 values for 2 columns"),
-        ("name,index_mcp_flexion\nv,80\n", "does not say its units"),
-    ],
-)
-def test_bad_csv_is_reported_in_one_sentence(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(ToftrackError, match=words):
-        gestures(str(write_csv(tmp_path, text)))
-
-
-def test_a_file_that_is_none_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
-        gestures(str(tmp_path / "none.json"))
+    ):
+        with pytest.raises(ToftrackError, match=words):
+            gestures(str(write_csv(tmp_path, text)))
+    (tmp_path / "broken.json").write_text("{")
+    for name in ("none.json", "broken.json"):
+        with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
+            gestures(str(tmp_path / name))
     with pytest.raises(ToftrackError, match="neither .json nor .csv"):
         gestures(str(tmp_path / "poses.txt"))
-    (tmp_path / "broken.json").write_text("{")
-    with pytest.raises(ToftrackError, match="cannot be read as a file of gestures"):
-        gestures(str(tmp_path / "broken.json"))
 
 
 STEADY = math.radians(25)

@@ -141,12 +141,7 @@ def test_hands_as_people_hold_them_are_what_they_are(label: str, angles: np.ndar
     assert label_of(angles) == label
 
 
-def test_tips_that_are_apart_are_not_ok() -> None:
-    assert label_of(pinched(5, 0, 0, 0)) != "ok"
-
-
-@pytest.mark.parametrize("turn", range(4))
-@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize(("turn", "side"), [(0, "right"), (1, "left")])
 def test_a_gesture_is_the_same_whichever_way_the_hand_is_turned(turn: int, side: str) -> None:
     generator = torch.Generator().manual_seed(turn)
     state = torch.zeros(1, 27)
@@ -158,14 +153,13 @@ def test_a_gesture_is_the_same_whichever_way_the_hand_is_turned(turn: int, side:
         assert turned == pytest.approx(seen(of_thumb(angles, thumbs[0])), abs=1e-3)
 
 
-@pytest.mark.parametrize("thumb", [None, "out", "up", "beside", "across", "tucked"])
 @pytest.mark.parametrize(("basic", "label"), [("palm",) * 2, ("fist",) * 2, ("gun", "pointing")])
 def test_the_papers_gestures_have_their_names_whatever_the_thumb_does(
-    basic: str, label: str, thumb: str | None
+    basic: str, label: str
 ) -> None:
-    _, reported, probability = update(None, seen(pose(basic, thumb)), SURE, ON, PAPER)
-    assert reported == label
-    assert probability > 0.95
+    for thumb in (None, "out", "up", "beside", "across", "tucked"):
+        _, reported, probability = update(None, seen(pose(basic, thumb)), SURE, ON, PAPER)
+        assert reported == label and probability > 0.95, thumb
 
 
 def test_each_transformation_runs_from_its_first_to_its_last_gesture() -> None:
@@ -189,16 +183,6 @@ def test_noise_leaves_a_gesture_what_it_is() -> None:
             assert label_of(noisy) == label
 
 
-def test_a_pose_far_off_the_pose_space_is_less_of_a_gesture_of_the_papers() -> None:
-    flat = seen(pose("palm"))
-    probabilities = [update(None, flat, SURE, off, PAPER)[2] for off in (0.0, 0.2, 0.3)]
-    assert probabilities[0] > probabilities[1] > probabilities[2]
-    assert label_of(pose("palm"), PAPER, off=0.5) == "other"
-    assert update(None, flat, SURE, math.nan, PAPER)[1] == "palm"
-    # Not so for those that a space of three gestures cannot hold.
-    assert label_of(pose("palm"), off=0.5) == "palm"
-
-
 def test_a_bad_score_says_nothing() -> None:
     fist, classes = seen(pose("fist")), len(GESTURES.names)
     _, _, probability = update(None, fist, 0.3, ON, GESTURES)
@@ -214,16 +198,16 @@ def test_a_bad_score_says_nothing() -> None:
 def test_labels_do_not_flicker_at_a_border() -> None:
     rng = np.random.default_rng(1)
     fist, palm = pose("fist"), pose("palm")
-    mixtures = [palm + part * (fist - palm) for part in np.linspace(1, 0.5, 101)]
+    mixtures = [palm + part * (fist - palm) for part in np.linspace(1, 0.5, 51)]
     border = next(angles for angles in mixtures if label_of(angles) != "fist")
-    between = [border + rng.normal(0, 0.15, 21) for _ in range(200)]
+    between = [border + rng.normal(0, 0.15, 21) for _ in range(120)]
     alone = [label_of(angles) for angles in between]
     followed = [label for label, _ in follow(between)]
 
     def changes(labels: list[str]) -> int:
         return sum(a != b for a, b in zip(labels, labels[1:], strict=False))
 
-    assert changes(alone) > 20, "a border worth testing"
+    assert changes(alone) > 12, "a border worth testing"
     assert changes(followed) < changes(alone) / 4
 
 
@@ -265,19 +249,14 @@ def test_only_a_pointing_hand_that_is_followed_has_a_ray() -> None:
         assert state is None
         assert reported.gesture == "" and math.isnan(reported.gesture_probability)
         assert math.isnan(reported.pinch) and not reported.pinching
-        assert (
-            np.isnan(reported.pointing_origin_m).all()
-            and np.isnan(reported.pointing_direction).all()
-        )
+        assert np.isnan((reported.pointing_origin_m, reported.pointing_direction)).all()
 
 
 @pytest.mark.parametrize(
     ("made", "doubted", "name"),
     [
-        ("gun", 7, ""),  # a joint of the index finger
         ("gun", 20, ""),  # the little finger, which is curled in both gestures that point
         ("gun", 4, ""),  # the thumb tells one of them from the other
-        ("palm", 16, ""),
         ("palm", 0, "palm"),  # no finger bends at the wrist
     ],
 )
@@ -289,11 +268,6 @@ def test_a_gesture_is_not_named_where_a_joint_that_decides_is_not_ok(
     assert reported.gesture == name
     assert math.isnan(reported.gesture_probability) == (name == "")
     assert np.isnan(reported.pointing_direction).all()
-
-
-def test_a_followed_hand_out_of_the_pose_space_is_other() -> None:
-    _, reported = tell_gesture(GESTURES, None, estimate(fingers(1, 2), "tracking", True), SPACE)
-    assert reported.lost and reported.gesture == "other"
 
 
 def test_a_fist_whose_thumb_lies_beside_the_index_finger_pinches_nothing(
@@ -318,11 +292,6 @@ def test_a_pose_that_is_surely_right_has_its_gesture_whatever_the_image_explains
     assert reported.gesture == name
 
 
-def test_without_gestures_there_are_no_labels() -> None:
-    state, reported = tell_gesture(None, None, estimate(pose("gun")), SPACE)
-    assert state is None and reported.gesture == "" and math.isnan(reported.gesture_probability)
-
-
 @pytest.mark.parametrize("bad", [{"off_rad": 0.0}, {"smoothing": 1.0}, {"known": "most"}])
 def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures"):
@@ -332,6 +301,7 @@ def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
 def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     scene = sample()
     rows = range(55, 98)  # from the palm on; "" until the hand is found
+
     reported = follow_scene(scene.cut(*rows))
     labels = [one.gesture for one in reported]
     assert "palm" in labels[:6] and set(labels[:6]) <= {"palm", ""}

@@ -58,18 +58,6 @@ def test_a_small_hand_pinches_as_a_large_one() -> None:
     assert tip_gap(joints(0.3, 0.14)) == pytest.approx(tip_gap(joints(0.3, 0.21)), abs=1e-4)
 
 
-def test_pads_that_lie_on_each_other_touch_as_tips_that_meet() -> None:
-    """Last phalanges side by side, a radius of each between their axes."""
-    flat = joints(1.0).astype(np.float64)
-    along = (flat[8] - flat[7]) / np.linalg.norm(flat[8] - flat[7])
-    across = np.cross(along, [0.0, 0.0, 1.0])
-    across /= np.linalg.norm(across)
-    flat[4] = flat[8] + 0.0155 * across  # 8.3 and 7.1 mm of a hand of 190 mm
-    flat[3] = flat[4] - 0.025 * along
-    assert abs(tip_gap(flat)) < 0.015
-    assert pinch_of(flat, SETTINGS) == 1.0
-
-
 def test_a_pinch_that_trembles_about_a_threshold_begins_and_ends_once() -> None:
     rng = np.random.default_rng(0)
     way = np.concatenate((np.linspace(0, 1, 60), np.linspace(1, 0, 60)))

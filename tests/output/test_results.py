@@ -25,6 +25,7 @@ from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.frames.frame import Truth
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.output import records
 from toftrack.output.lines import (
     FRAME_FIELDS,
     HAND_FIELDS,
@@ -172,12 +173,6 @@ def test_summary_counts_and_averages(tmp_path: Path) -> None:
     assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
 
 
-def test_a_first_run_s_compiling_is_not_the_time_of_a_frame(tmp_path: Path) -> None:
-    slow = [estimate(i, compute_s=9.0 if i == 0 else 0.01) for i in range(5)]
-    line = metrics_table(write(tmp_path, slow).summary).splitlines()[1]
-    assert "10.0 ms (100.0 frames/s), the median; the mean, 1808.0 ms, holds what is" in line
-
-
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     estimates = [estimate(i) for i in range(12)]
     truth = truth_of(estimates, frames=20)  # the run was interrupted after 12 of 20
@@ -192,14 +187,8 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     assert further["swap_pct"] == 0 and further["tip_mm"] == pytest.approx(10 * math.sqrt(3))
     assert summary["metrics"] == expected | {"further": further}
     assert summary["metrics"]["trust"]["usable_pct"] == 75  # one in four is flagged
-    table = metrics_table(summary).splitlines()
-    assert table[0].split() == "usable 75.0 % of the 12 visible frames".split()
-    assert table[2].split() == "false alarms 25.0 %".split()
-    truth.joints_m[0, 8] += 0.05
-    there = metrics_table(write(tmp_path / "b", estimates, truth).summary).splitlines()[0]
-    assert there.endswith("; in 8.3 % some joints are over 40 mm off, their mean is not")
-    assert "in their 90 % region  100.0 % of the joints" in table
     assert summary["metrics"]["mean_mm"] == pytest.approx(10 * math.sqrt(3), rel=1e-4)
+    assert "75.0 % of the 12 visible frames" in metrics_table(summary).splitlines()[0]
 
 
 def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
@@ -209,12 +198,6 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
         raise KeyboardInterrupt
     assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
-
-
-def test_no_frame_at_all_still_gives_whole_files(tmp_path: Path) -> None:
-    write(tmp_path, [], truth_of([], 5))
-    assert read_results(tmp_path / "track.npz")["joints_m"].shape == (0, 21, 3)
-    assert json.loads((tmp_path / "summary.json").read_text())["mean_ms"] is None
 
 
 def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
@@ -262,8 +245,6 @@ def test_a_second_run_into_a_folder_is_refused_while_the_first_lives(tmp_path: P
 
 
 class FullDisk:
-    """Takes so many bytes of a file."""
-
     def __init__(self, file: io.FileIO, capacity: int) -> None:
         self._file, self._capacity = file, capacity
 
@@ -302,7 +283,11 @@ def test_a_folder_that_is_removed_or_renamed_is_reported(tmp_path: Path) -> None
     assert recover(tmp_path / "now")["frames"] == 1
 
 
-def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+def test_memory_does_not_grow_with_the_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(records, "_PIECE", 16)  # frames that are held at once
+
     def peak(frames: int) -> int:
         tracemalloc.start()
         with ResultWriter(tmp_path / str(frames), {}, NAMES) as writer:
@@ -313,8 +298,8 @@ def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
         return found
 
     one = estimate(0)
-    few, many = peak(600), peak(800)
-    assert many - few < 200 * 200  # a frame's numbers alone are 1100 bytes
+    few, many = peak(50), peak(110)
+    assert many - few < 60 * 200  # a frame's numbers alone are 1100 bytes
 
 
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
@@ -331,25 +316,20 @@ def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    ("number", "bad", "words"),
+    ("number", "changes", "words"),
     [
-        (1, "{]", "line 2 of"),
-        (1, '{"index":1}', "shortly before"),
-        (0, {"index": None}, "'index'"),
+        (1, None, "line 2 of"),
         (0, {"joints_m": [[0, 0, 0]]}, "shape"),
         (0, {"index": 10**19}, "shortly before"),
     ],
 )
 def test_a_line_that_is_damaged_is_named(
-    tmp_path: Path, number: int, bad: str | dict[str, Any], words: str
+    tmp_path: Path, number: int, changes: dict[str, Any] | None, words: str
 ) -> None:
     write(tmp_path, [estimate(i) for i in range(4)])
     path = tmp_path / "track.jsonl"
     lines = path.read_text().splitlines()
-    if isinstance(bad, dict):
-        line = json.loads(lines[number]) | bad
-        bad = json.dumps({k: v for k, v in line.items() if v is not None or k not in bad})
-    lines[number] = bad
+    lines[number] = "{]" if changes is None else json.dumps(json.loads(lines[number]) | changes)
     path.write_text("\n".join(lines) + "\n")
     with pytest.raises(ToftrackError, match=words):
         recover(tmp_path)
@@ -371,11 +351,6 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     with pytest.raises(ToftrackError) as error:
         recover(tmp_path)
     assert "\n" not in str(error.value)
-
-
-def test_a_number_far_beyond_the_others_fills_no_disk(tmp_path: Path) -> None:
-    write(tmp_path, [estimate(0), replace(estimate(1), index=10**15)])
-    assert read_results(tmp_path / "track.npz")["index"].tolist() == [0, 10**15]
 
 
 @pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])
@@ -409,27 +384,11 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
 
 
-def test_metadata_may_hold_arrays_paths_and_nan(tmp_path: Path) -> None:
-    metadata = {"K": np.eye(2), "file": Path("a"), "unknown": math.nan, "n": np.int64(3)}
-    ResultWriter(tmp_path, metadata, NAMES, None).close()
-    kept = {"K": [[1, 0], [0, 1]], "file": "a", "unknown": None, "n": 3}
-    assert read_results(tmp_path / "track.npz")["metadata"] == kept
-
-
-def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
-    writer = ResultWriter(tmp_path, {}, NAMES, None)
-    writer.append((estimate(0),))
-    (tmp_path / "track.npz").mkdir()
-    with pytest.raises(ToftrackError, match="cannot be written"):
-        writer.close()
-    assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
-
-
-@pytest.mark.parametrize("content", [None, b"", b"text", b"PK\x03\x04broken"])
-def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | None) -> None:
+def test_a_file_that_is_no_result_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "track.npz"
-    if content is not None:
-        path.write_bytes(content)
+    with pytest.raises(ToftrackError, match="track.npz"):
+        read_results(path)
+    path.write_bytes(b"PK\x03\x04broken")
     with pytest.raises(ToftrackError, match="track.npz"):
         read_results(path)
 
@@ -438,7 +397,6 @@ def test_a_file_that_is_no_result_is_reported(tmp_path: Path, content: bytes | N
     "changes",
     [
         {"lost": np.array(False)},
-        {"lost": np.zeros((2, 1, 1), bool)},
         {"score": np.zeros((2, 3), np.float32)},
         {"metadata": np.array("[]")},
     ],
@@ -532,17 +490,30 @@ def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_pat
     assert not content["pinching"][0, 1]
 
 
-def test_frames_without_any_hand_are_whole_rows(tmp_path: Path) -> None:
-    """Also where no frame has one: the shapes are as ever."""
-    write_slots(tmp_path / "never", [(vacant(i), vacant(i)) for i in range(3)])
-    write_slots(tmp_path / "none", [])
-    for name, rows in (("never", 3), ("none", 0)):
-        content = read_results(tmp_path / name / "track.npz")
-        assert content["covariance"].shape == (rows, 2, 10, 10)
-        assert content["lost"].all() and np.isnan(content["score"]).all()
-    summary = json.loads((tmp_path / "never" / "summary.json").read_text())
-    assert (summary["lost_frames"], summary["mean_score"]) == (3, None)
-    assert "3, 3 of them lost" in metrics_table(summary)
+def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
+    known = two_truths()
+    metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
+    content = read_results(tmp_path / "track.npz")
+    assert (metrics["slot"], metrics["second"]["slot"]) == (1, 0)
+    for found, one in ((metrics, known), (metrics["second"], known.other)):
+        assert one is not None
+        joints, lost = content["joints_m"][:, found["slot"]], content["lost"][:, found["slot"]]
+        assert found["trust"] == asdict(trust(judged(joints, lost, one)))
+        figures = evaluate(joints, lost, one)
+        assert {name: found[name] for name in figures} == figures
+        assert found["coverage"]["in_region_90_pct"] == 100
+    assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
+    table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
+    assert "the other hand" in table and table.count("usable") == 2
+
+
+def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
+    writer = ResultWriter(tmp_path, {}, NAMES, None)
+    writer.append((estimate(0),))
+    (tmp_path / "track.npz").mkdir()
+    with pytest.raises(ToftrackError, match="cannot be written"):
+        writer.close()
+    assert (tmp_path / "track.jsonl").read_text().count("\n") == 1
 
 
 def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
@@ -569,35 +540,3 @@ def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
     assert [one["hand"]["side"] for one in (first, second)] == ["left", "right"]
     assert second["hand"]["length_mm"] == pytest.approx(180)
     assert "slot 1" in metrics_table(summary)
-
-
-def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
-    known = two_truths()
-    metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
-    content = read_results(tmp_path / "track.npz")
-    assert (metrics["slot"], metrics["second"]["slot"]) == (1, 0)
-    for found, one in ((metrics, known), (metrics["second"], known.other)):
-        assert one is not None
-        joints, lost = content["joints_m"][:, found["slot"]], content["lost"][:, found["slot"]]
-        assert found["trust"] == asdict(trust(judged(joints, lost, one)))
-        figures = evaluate(joints, lost, one)
-        assert {name: found[name] for name in figures} == figures
-        assert found["coverage"]["in_region_90_pct"] == 100
-    assert metrics["trust"]["usable_pct"] == pytest.approx(100 * 8 / 9)
-    table = metrics_table(json.loads((tmp_path / "summary.json").read_text()))
-    assert "the other hand" in table and table.count("usable") == 2
-
-
-def test_a_second_hand_that_nobody_has_is_reported(tmp_path: Path) -> None:
-    summary = write_slots(tmp_path, two_hands(), replace(two_truths(), other=None))
-    assert summary["metrics"]["slot"] == 1 and "second" not in summary["metrics"]
-    assert summary["metrics"]["ghost_pct"] == 100
-    assert "another hand, where is none" in metrics_table(summary)
-
-
-def test_a_slot_that_there_is_not_is_a_damaged_line(tmp_path: Path) -> None:
-    write_slots(tmp_path, two_hands())
-    path = tmp_path / "track.jsonl"
-    path.write_text(path.read_text().replace('"slot":1', '"slot":7'))
-    with pytest.raises(ToftrackError, match="not a line of a run"):
-        recover(tmp_path)

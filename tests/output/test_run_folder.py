@@ -5,32 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 from helpers.hands import hand_estimate
 
 import toftrack
-from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import ResultWriter
-from toftrack.output.run_folder import read_run
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    with ResultWriter(tmp_path, {}, JOINT_NAMES) as writer:
-        writer.append((hand_estimate(0),))
-    default_hand_shape().save(tmp_path / "hand_shape.json")
-    return tmp_path
-
-
-def test_a_configuration_that_is_no_object_is_reported(folder: Path) -> None:
-    with np.load(folder / "track.npz") as content:
-        arrays = dict(content)
-    np.savez(folder / "track.npz", **(arrays | {"metadata": np.array('{"config": [1]}')}))
-    with pytest.raises(ToftrackError, match="does not say with which likelihood"):
-        read_run(folder).likelihood()
 
 
 def test_a_run_tells_its_arrays_times_camera_and_summary(tmp_path: Path) -> None:
@@ -48,8 +29,3 @@ def test_a_run_tells_its_arrays_times_camera_and_summary(tmp_path: Path) -> None
     assert (run.camera.width, run.camera.height) == (160, 120)
     np.testing.assert_array_equal(run.camera.K, camera.K)
     assert run.estimate(2).index == 2
-
-
-def test_a_run_that_does_not_say_its_camera_is_reported(folder: Path) -> None:
-    with pytest.raises(ToftrackError, match="with which camera"):
-        _ = read_run(folder).camera

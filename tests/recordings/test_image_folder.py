@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.damage import damaged
+from helpers.programs import QUICK
 from helpers.tracking import ROOT
 
 from toftrack.api import make_device
@@ -23,7 +24,7 @@ from toftrack.errors import ToftrackError
 from toftrack.output.run_folder import read_run
 from toftrack.programs import convert
 from toftrack.programs.main import main
-from toftrack.recordings import image_folder, images
+from toftrack.recordings import image_folder
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.image_folder import read_image_folder
 from toftrack.recordings.images import decoded_png
@@ -56,7 +57,7 @@ def test_the_camera_file_that_the_page_shows_is_read(folder: Path) -> None:
 def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["view=none", "hand.side=right", f"hydra.run.dir={tmp_path / 'run'}"]
+    words = ["view=none", "hand.side=right", f"hydra.run.dir={tmp_path / 'run'}", *QUICK]
     assert main(["track", str(folder), *words]) == 1
     assert "device.intrinsics=[FX,FY,CX,CY]" in capsys.readouterr().err
     assert main(["track", str(folder), LENS, "device.fps=50", *words]) == 0
@@ -68,29 +69,9 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     np.testing.assert_array_equal(footage.camera.K, K)
 
 
-def test_the_lens_of_any_recording_can_be_given(tmp_path: Path) -> None:
-    path = tmp_path / "a.npz"
-    depth = np.random.default_rng(0).uniform(0.4, 2, (2, 144, 176)).astype(np.float32)
-    np.savez(path, depth_m=depth, K=np.array(K) * 2 - np.diag([0, 0, 1]), distortion=[0.1, 0, 0, 0])
-    camera = Replay(path, intrinsics=[201, 202, 87, 71]).camera
-    np.testing.assert_array_equal(camera.K, K)
-    assert not camera.distortion.any()
-    np.save(tmp_path / "b.npy", depth)
-    with make_device("device=replay", f"device.path={tmp_path / 'b.npy'}", LENS) as device:
-        np.testing.assert_array_equal(device.camera.K, K)
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ("[200,200,88]", "intrinsics must be four numbers of pixels"),
-        ("[-1,200,88,72]", r"fx, fy \(above 0\)"),
-        ("200", "intrinsics must be four numbers of pixels.*but are 200"),
-        ("[1,1,88,72]", "cannot be that of images of 176x144 pixels"),
-    ],
-)
-def test_lenses_that_are_none_are_reported(given: str, words: str, folder: Path) -> None:
-    with pytest.raises(ToftrackError, match=words) as caught:
+@pytest.mark.parametrize("given", ["[200,200,88]", "[-1,200,88,72]", "200", "[1,1,88,72]"])
+def test_lenses_that_are_none_are_reported(given: str, folder: Path) -> None:
+    with pytest.raises(ToftrackError, match="intrinsics|of 176x144 pixels") as caught:
         make_device("device=folder", f"device.path={folder}", f"device.intrinsics={given}")
     assert "\n" not in str(caught.value)
 
@@ -108,13 +89,10 @@ IMAGE = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32)
 CONTENT = cv2.imencode(".png", IMAGE)[1].tobytes()
 
 
-def test_a_whole_image_is_decoded() -> None:
+def test_an_image_that_was_cut_off_is_none() -> None:
     assert (decoded_png(CONTENT) == IMAGE).all()
-
-
-@pytest.mark.parametrize("length", [0, 8, 20, len(CONTENT) // 2, len(CONTENT) - 1])
-def test_an_image_that_was_cut_off_is_none(length: int) -> None:
-    assert decoded_png(CONTENT[:length]) is None
+    for length in (0, 8, 20, len(CONTENT) // 2, len(CONTENT) - 1):
+        assert decoded_png(CONTENT[:length]) is None
 
 
 def test_a_chunk_that_claims_gigabytes_is_not_handed_to_the_decoder(
@@ -167,7 +145,6 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     "folders": {"rgb/{}.png": COLOUR, "depth/{}.png": png, "camera.txt": b""},
     "float TIFF": {"{}.tif": tiff, "{}.jpg": b""},
     "EXR": {"{}.exr": exr},
-    "grey EXR": {"{}.exr": lambda number: exr(number, "A.R A.G A.B")},
     "rendered EXR": {"{}.exr": lambda number: exr(number, "B G R View.Depth.Z View.Normal.Z")},
 }
 
@@ -189,12 +166,7 @@ def test_the_depth_among_the_images_is_read_and_the_rest_told(
     assert (store.left_out is not None) == any(
         word in pattern for pattern in LAYOUTS[layout] for word in ("rgb", "color", "infra", "jpg")
     )
-    with (
-        caplog.at_level(logging.WARNING),
-        make_device(
-            "device=replay", f"device.path={path}", "device.intrinsics=[40,40,15.5,11.5]"
-        ) as device,
-    ):
+    with caplog.at_level(logging.WARNING), Replay(path, intrinsics=GIVEN.intrinsics) as device:
         assert len(list(device)) == 3
     assert ("are left out" in caplog.text) == (store.left_out is not None)
 
@@ -210,27 +182,25 @@ def test_the_depth_among_the_images_is_read_and_the_rest_told(
         ({"1.tif": cv2.imencode(".tif", 1000 * DEPTH[0])[1].tobytes()}, "plainly another unit"),
     ],
 )
-@pytest.mark.parametrize("zipped", [False, True], ids=["folder", "zip"])
 def test_images_that_are_no_depth_are_reported(
-    tmp_path: Path, files: dict[str, bytes], words: str, zipped: bool
+    tmp_path: Path, files: dict[str, bytes], words: str
 ) -> None:
     if "1.exr" in files:
         exr(0)
-    with pytest.raises(ToftrackError, match=words) as caught:
-        read_image_folder(laid_out(tmp_path, files, zipped), bare=GIVEN)
-    assert "\n" not in str(caught.value)
+    for zipped in (False, True):
+        with pytest.raises(ToftrackError, match=words):
+            read_image_folder(laid_out(tmp_path, files, zipped), bare=GIVEN)
 
 
 @pytest.mark.parametrize(
     ("name", "mode", "method", "words"),
     [
-        ("../1.png", 0, zipfile.ZIP_DEFLATED, "leads out of it"),
-        ("/1.png", 0, zipfile.ZIP_DEFLATED, "leads out of it"),
-        ("a\\..\\1.png", 0, zipfile.ZIP_DEFLATED, "leads out of it"),
-        ("C:/1.png", 0, zipfile.ZIP_DEFLATED, "leads out of it"),
+        *(
+            (name, 0, zipfile.ZIP_DEFLATED, "leads out of it")
+            for name in ("../1.png", "/1.png", "a\\..\\1.png", "C:/1.png", "\0")
+        ),
         ("1.png", 0o120777, zipfile.ZIP_DEFLATED, "is a link"),
         ("1.png", 0, zipfile.ZIP_LZMA, "compression is not read"),
-        ("1.png", 0, zipfile.ZIP_BZIP2, "compression is not read"),
     ],
 )
 def test_archives_that_lead_elsewhere_are_refused(
@@ -263,19 +233,12 @@ def test_archives_that_lie_or_would_fill_the_memory_are_refused(
             read_image_folder(path, bare=GIVEN).image(0)
 
 
-@pytest.mark.parametrize("text", ["1 " * 2**20, "x" * 2**22, "1 " * 2**24, "", "nan"])
+@pytest.mark.parametrize("text", ["1 " * 2**20, "x" * 2**22, "nan"])
 def test_times_that_cannot_be_meant_take_no_time_and_no_page(tmp_path: Path, text: str) -> None:
     path = laid_out(tmp_path, {"1.png": png(0), "timestamps.txt": text.encode()}, True)
     with pytest.raises(ToftrackError, match="timestamps.txt") as caught:
         read_image_folder(path, bare=GIVEN)
     assert len(str(caught.value)) < 999
-
-
-def test_names_of_thousands_of_digits_are_in_order(tmp_path: Path) -> None:
-    names = ["a2.png", "a10.png", f"a{'1' * 5000}.png", f"a{'2' * 5000}.png"]
-    path = laid_out(tmp_path, dict.fromkeys(reversed(names), png(0)), True)
-    with Replay(path, intrinsics=GIVEN.intrinsics) as device:
-        assert device.description["files"] == names
 
 
 def test_names_of_others_do_not_command_the_terminal(tmp_path: Path) -> None:
@@ -285,18 +248,9 @@ def test_names_of_others_do_not_command_the_terminal(tmp_path: Path) -> None:
     assert str(caught.value).isprintable()
 
 
-def test_an_exr_with_more_in_it_than_an_image_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(images, "LARGEST_PIXELS", 2 * DEPTH[0].size)
-    read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A")}, False), bare=GIVEN)
-    with pytest.raises(ToftrackError, match="larger than any camera's"):
-        read_image_folder(laid_out(tmp_path, {"1.exr": exr(0, "Z A B")}, False), bare=GIVEN)
-
-
 def test_an_exr_that_is_damaged_is_read_or_told(tmp_path: Path) -> None:
     content = exr(0)
-    for seed in range(300):  # OpenEXR's older interface ended the process at one of twenty
+    for seed in range(100):  # OpenEXR's older interface ended the process at one of twenty
         path = laid_out(tmp_path, {"1.exr": damaged(content, seed)}, False)
         with contextlib.suppress(ToftrackError):
             read_image_folder(path, bare=GIVEN)
@@ -311,13 +265,3 @@ def test_an_archive_is_converted_with_its_camera_and_times(tmp_path: Path) -> No
     with make_device("device=replay", f"device.path={tmp_path / 'out.npz'}") as device:
         assert [frame.timestamp_s for frame in device] == [1, 1.5, 2]
         assert device.camera.K[0, 0] == 40
-
-
-def test_a_file_without_a_name_in_a_zip_is_one_sentence(tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "images.zip", "w") as archive:
-        archive.writestr("x", b"")
-    content = (tmp_path / "images.zip").read_bytes()
-    # A name that begins with a zero ends there.
-    (tmp_path / "images.zip").write_bytes(content.replace(b"x", b"\0"))
-    with pytest.raises(ToftrackError, match="leads out of it"):
-        read_image_folder(tmp_path / "images.zip")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import pickle
 import re
 import zipfile
@@ -13,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.recordings import npz
 from toftrack.recordings.npz import read_recording, write_recording
@@ -80,6 +78,8 @@ def test_two_keys_are_enough(tmp_path: Path) -> None:
     assert recording.truth is None
     assert recording.metadata == {}
     np.testing.assert_allclose(recording.timestamp_s, np.arange(T) / 25)
+    truth = read_recording(save(tmp_path, visible=None, in_space=None)).truth
+    assert truth.visible.all() and truth.in_space.all()
 
 
 @pytest.mark.parametrize(
@@ -87,7 +87,6 @@ def test_two_keys_are_enough(tmp_path: Path) -> None:
     [
         ({"timestamp_s": None, "fps": 50.0}, 50, 0.02),
         ({"timestamp_s": np.arange(T) * 0.2, "fps": 50.0}, 5, 0.2),
-        ({"timestamp_s": None}, 25, 0.04),
     ],
 )
 def test_times_come_from_stamps_then_rate(
@@ -98,15 +97,8 @@ def test_times_come_from_stamps_then_rate(
     np.testing.assert_allclose(np.diff(recording.timestamp_s), step)
 
 
-def test_truth_without_flags_is_visible_and_in_space(tmp_path: Path) -> None:
-    truth = read_recording(save(tmp_path, visible=None, in_space=None)).truth
-    assert truth.visible.all()
-    assert truth.in_space.all()
-
-
-@pytest.mark.parametrize("radial", [False, True])
-@pytest.mark.parametrize("kind", [np.float16, np.float32])
-def test_write_then_read_is_the_same(tmp_path: Path, radial: bool, kind: type) -> None:
+@pytest.mark.parametrize(("kind", "radial"), [(np.float16, False), (np.float32, True)])
+def test_write_then_read_is_the_same(tmp_path: Path, kind: type, radial: bool) -> None:
     depth = arrays()["depth_m"].astype(kind)
     changes = {"depth_m": None, "radial_m": depth} if radial else {"depth_m": depth}
     first = read_recording(save(tmp_path, **changes))
@@ -160,15 +152,6 @@ def packed_and_damaged(path: Path) -> None:
     path.write_bytes(data)
 
 
-def with_a_short_member(path: Path) -> None:
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, value in arrays().items():
-            stream = io.BytesIO()
-            np.save(stream, value)
-            content = stream.getvalue()
-            archive.writestr(f"{name}.npy", content[:-50] if name == "depth_m" else content)
-
-
 def a_single_array(path: Path) -> None:
     with path.open("wb") as stream:
         np.save(stream, np.ones(3))
@@ -178,12 +161,10 @@ def a_single_array(path: Path) -> None:
     ("harm", "words"),
     [
         (lambda path: (path.unlink(), path.mkdir()), "is a directory"),
-        (lambda path: path.write_bytes(b""), "it is no .npz archive"),
         (a_single_array, "it is no .npz archive"),
         (without_end, "cut off"),
         (flipped, "damaged"),
         (packed_and_damaged, "damaged"),
-        (with_a_short_member, "damaged"),
     ],
 )
 def test_damaged_files_are_reported(
@@ -232,15 +213,6 @@ def test_frames_that_are_counted_last_are_reported(tmp_path: Path, reported: str
     assert len(read_recording(path)) == 48
 
 
-@pytest.mark.parametrize(("level", "words"), [(0.0, "no pixel has a reading"), (0.6, "0.6 m")])
-def test_images_of_nothing_are_read_and_doubted(
-    tmp_path: Path, level: float, words: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    assert len(list(Replay(save(tmp_path, depth_m=np.full((T, H, W), level, np.float32))))) == T
-    (message,) = caplog.messages
-    assert words in message and "recording.npz" in message
-
-
 IMAGES = np.ones((T, H, W), np.float32)
 
 
@@ -251,30 +223,22 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("K", None, "missing"),
         ("depth_m", IMAGES[0], "3 dimensions"),
         ("depth_m", IMAGES[:0], "zero frames"),
-        ("depth_m", IMAGES[:, :0], "empty"),
         ("depth_m", IMAGES.astype(complex), "float32"),
         ("depth_m", (500 * IMAGES).astype(np.uint16), "millimetres.*/ 1000"),
         ("depth_m", 480 * IMAGES, "millimetres.*/ 1000"),
         ("depth_m", 40 * IMAGES, "centimetres.*/ 100"),
         ("depth_m", 1e-6 * IMAGES, "neither metres nor millimetres"),
-        ("depth_m", (40_000 * IMAGES).astype(np.uint16), "neither metres nor millimetres"),
         ("K", np.eye(4), "3x3"),
         ("K", np.full((3, 3), np.nan), "NaN"),
-        ("K", np.zeros((3, 3)), "positive focal"),
-        ("K", np.array([[20.0, 0, 4], [0, 20, 3], [4, 3, 1]]), "0, 0, 1"),
         ("joints_m", np.zeros((T, 20, 3)), ""),
         ("joints_m", np.full((T, 21, 3), np.nan), ""),
         ("visible", np.ones(T + 1, bool), ""),
-        ("joint_visible", np.ones((T, 20), bool), ""),
         ("amplitude", np.ones((T, H, W - 1), np.uint16), ""),
-        ("amplitude", np.ones((T, H, W), np.float32), ""),
         ("timestamp_s", np.arange(T - 1.0), ""),
         ("timestamp_s", np.array([0.0, 0.1, 0.05, 0.2]), ""),
         ("fps", 0.0, ""),
-        ("fps", "fast", ""),
         ("distortion", np.zeros(3), ""),
         ("metadata", "no json", ""),
-        ("metadata", "[1]", ""),
     ],
 )
 def test_what_breaks_the_format_is_reported_by_its_key(
@@ -282,10 +246,6 @@ def test_what_breaks_the_format_is_reported_by_its_key(
 ) -> None:
     text = complaint(save(tmp_path, **{key: value}))
     assert key in text and re.search(words, text)
-
-
-def test_a_recording_without_any_reading_is_valid(tmp_path: Path) -> None:
-    assert len(read_recording(save(tmp_path, depth_m=np.nan * IMAGES))) == T
 
 
 LONG = np.random.default_rng(0).uniform(0.3, 1.0, (9, 60, 80)).astype(np.float32)
@@ -301,12 +261,6 @@ def long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "long.npz"
 
 
-def test_a_long_one_is_played_like_another(long: Path) -> None:
-    frames = list(Replay(long, start=2, stop=7))
-    assert [frame.index for frame in frames] == [2, 3, 4, 5, 6]
-    np.testing.assert_array_equal(np.stack([frame.depth for frame in frames]), LONG[2:7])
-
-
 def test_damage_on_the_way_is_reported_when_it_is_met(long: Path) -> None:
     content = bytearray(long.read_bytes())
     with zipfile.ZipFile(long) as archive:
@@ -317,13 +271,3 @@ def test_damage_on_the_way_is_reported_when_it_is_met(long: Path) -> None:
     with pytest.raises(ToftrackError, match="long.npz' is damaged .*CRC"):
         for index in range(9):
             recording.image(index)
-
-
-@pytest.mark.parametrize(
-    "changes",
-    [{"depth_m": np.asfortranarray(LONG)}, {"amplitude": LONG.astype(np.int32)}],
-)
-def test_what_cannot_be_read_in_turn_is_reported(long: Path, changes: dict) -> None:
-    np.savez(long, **{"depth_m": LONG, "K": K} | changes)
-    with pytest.raises(ToftrackError, match="long.npz"):
-        read_recording(long)

@@ -17,13 +17,11 @@ from helpers.damage import damaged
 from scipy.io import savemat
 
 from toftrack.api import make_device
-from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert
 from toftrack.recordings import matlab, stacks
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.matlab import read_matlab
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.store import ELSEWHERE, open_recording
 
@@ -95,8 +93,9 @@ def test_every_stack_gives_the_frames_that_went_in(tmp_path: Path, kind: str) ->
 def test_what_is_damaged_or_cut_off_is_read_or_told(tmp_path: Path, kind: str) -> None:
     path = KINDS[kind](tmp_path)
     content = path.read_bytes()
-    cut = [content[: len(content) * part // 10] for part in range(10)]
-    for new in (*cut, *(damaged(content, seed) for seed in range(40))):
+    often = 1 if kind in ("MATLAB", "SciPy's .mat") else 10  # each in a process of its own
+    cut = [content[: len(content) * part // (2 * often)] for part in range(1, 2 * often)]
+    for new in (*cut, *(damaged(content, seed) for seed in range(3 * often))):
         path.write_bytes(new)
         with contextlib.suppress(ToftrackError):
             store = opened(path)
@@ -116,19 +115,14 @@ def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
         store.image(4)
 
 
-def test_a_npy_in_fortran_order_stays_as_it_was_when_the_file_shrinks(
+def test_a_npy_in_fortran_order_is_loaded_where_it_is_not_too_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    path = tmp_path / "a.npy"
-    np.save(path, np.asfortranarray(WORDS))
-    store = opened(path)
-    os.truncate(path, path.stat().st_size - HEIGHT * WIDTH * 2)
-    for number in range(COUNT):
-        np.testing.assert_allclose(store.image(number)[0], METRES[number], atol=1e-6)
-    np.save(path, np.asfortranarray(WORDS))
+    np.save(tmp_path / "a.npy", np.asfortranarray(WORDS))
+    np.testing.assert_allclose(opened(tmp_path / "a.npy").image(3)[0], METRES[3], atol=1e-6)
     monkeypatch.setattr(stacks, "MOST_BYTES", WORDS.nbytes - 1)
     with pytest.raises(ToftrackError, match="numpy.ascontiguousarray"):
-        opened(path)
+        opened(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])
@@ -136,9 +130,13 @@ def test_the_dataset_is_chosen_by_its_name(tmp_path: Path, write: Callable[..., 
     path = write(tmp_path / f"a.{'h5' if write is hdf5 else 'mat'}", depth=WORDS, ir=WORDS // 2)
     with pytest.raises(ToftrackError, match=r"device\.dataset=NAME.*depth.*ir"):
         opened(path)
+    np.testing.assert_allclose(opened(path, "ir").image(1)[0], WORDS[1] // 2 / 1000, atol=1e-6)
+
+
+def test_dataset_unit_and_rate_are_given_on_the_command_line(tmp_path: Path) -> None:
+    path = hdf5(tmp_path / "a.h5", depth=WORDS, ir=WORDS // 2)
     with pytest.raises(ToftrackError, match="no array of images 'color'.*depth"):
         opened(path, "color")
-    np.testing.assert_allclose(opened(path, "ir").image(1)[0], WORDS[1] // 2 / 1000, atol=1e-6)
     words = [f"device.path={path}", "device.dataset=/depth", "device.unit_m=0.0005"]
     lens = "device.intrinsics=[40,40,15.5,11.5]"
     with make_device("device=replay", *words, lens, "device.fps=50") as device:
@@ -148,14 +146,6 @@ def test_the_dataset_is_chosen_by_its_name(tmp_path: Path, write: Callable[..., 
     out, numbers = str(tmp_path / "out.npz"), "40 40 15.5 11.5".split()
     convert.main([str(path), out, "--dataset", "depth", "--intrinsics", *numbers])
     np.testing.assert_allclose(read_recording(out).image(2)[0], METRES[2], atol=1e-6)
-
-
-@pytest.mark.parametrize("given", [{"unit_m": 0.002}, {"fps": 7}, {"dataset": "depth"}])
-def test_what_a_recording_says_itself_is_not_given(tmp_path: Path, given: dict[str, Any]) -> None:
-    path = tmp_path / "a.npz"
-    np.savez(path, depth_m=METRES, K=np.diag((40, 40, 1)))
-    with pytest.raises(ToftrackError, match=f"leave device.{next(iter(given))} out"):
-        Replay(path, **given)
 
 
 def directory(width: int, height: int, following: int = 0, tile: int = 0) -> bytes:
@@ -172,10 +162,8 @@ def directory(width: int, height: int, following: int = 0, tile: int = 0) -> byt
         (directory(60_000, 60_000), "larger than any camera's"),
         (directory(32, 24, 0, 100_000), "tiles are larger"),
         (directory(32, 24, 8), "no end"),
-        (directory(32, 24, 2**31), "damaged"),
         (b"II+\0" + bytes(4) + struct.pack("<Q", 2**63), "damaged"),
         (cv2.imencode(".tif", np.zeros((4, 4, 3), np.uint8))[1].tobytes(), "grey"),
-        (b"nonsense", "grey"),
     ],
 )
 def test_a_tiff_that_lies_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
@@ -217,15 +205,6 @@ def test_a_mat_file_that_would_fill_the_memory_is_refused(
         opened(tmp_path / "a.mat")
 
 
-def test_numbers_of_matlab_files_are_read_in_their_own_type(tmp_path: Path) -> None:
-    wanted = np.random.default_rng(0).integers(0, 200, (2, 3, 4, 5)).astype(np.int16)
-    content: dict[str, Any] = {"before": {"a": np.eye(2)}, "wanted": wanted, "x": np.arange(3.0)}
-    savemat(tmp_path / "some.mat", content, do_compression=True)
-    read = read_matlab(tmp_path / "some.mat", "wanted")
-    assert read.dtype == wanted.dtype
-    np.testing.assert_array_equal(read, wanted)
-
-
 def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path) -> None:
     """As SciPy 1.17 does where the type of an array's elements is none."""
     savemat(tmp_path / "a.mat", {"a": METRES.astype(np.float64)})
@@ -242,22 +221,6 @@ def test_modules_beside_a_matlab_file_are_not_run(
     (tmp_path / "numpy.py").write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
     assert len(opened(mat(tmp_path / "a.mat", depth=METRES))) == COUNT
-
-
-def test_an_archive_that_is_called_npy_is_no_stack(tmp_path: Path) -> None:
-    with open(tmp_path / "a.npy", "wb") as file:
-        np.savez(file, depth_m=METRES)
-    with pytest.raises(ToftrackError, match="a.npy' cannot be read"):
-        opened(tmp_path / "a.npy")
-
-
-def test_a_deep_pile_of_groups_takes_no_time(tmp_path: Path) -> None:
-    with h5py().File(tmp_path / "a.h5", "w") as file:
-        group = file
-        for _ in range(100):
-            group = group.create_group("a")
-    with pytest.raises(ToftrackError, match="nested too deeply"):
-        opened(tmp_path / "a.h5")
 
 
 def test_objects_of_a_mat_file_are_no_images(tmp_path: Path) -> None:

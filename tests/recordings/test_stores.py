@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -28,9 +27,8 @@ GIVEN = BareFacts((252.0, 253.0, 166.0, 140.0))
 RANGE_M = unambiguous_range_m(20)
 
 
-def of_npz(folder: Path, words: np.ndarray) -> Path:
-    amplitude, K = words[:, ::-1], CAMERA.K
-    np.savez_compressed(folder / "a.npz", depth_m=metres(words), amplitude=amplitude, K=K)
+def of_npz(folder: Path, words: np.ndarray, save: Callable = np.savez) -> Path:
+    save(folder / "a.npz", depth_m=metres(words), amplitude=words[:, ::-1], K=CAMERA.K)
     return folder / "a.npz"
 
 
@@ -67,7 +65,7 @@ def of_bag(kind: str) -> Callable[[Path, np.ndarray], Path]:
 
 KINDS: dict[str, Callable[[Path, np.ndarray], Path]] = {
     "npz": of_npz,
-    "long npz": of_npz,
+    "long npz": lambda folder, words: of_npz(folder, words, np.savez_compressed),
     "srs": of_srs,
     "folder": of_folder,
     "npy": of_stack,
@@ -121,23 +119,23 @@ def test_frames_come_in_any_order_and_after_closing(
 
 
 @each_kind
-@pytest.mark.parametrize("share", [None, 0.0, 0.002, 0.3, 0.9, 0.999])
-def test_whatever_is_damaged_or_cut_off_it_is_read_or_reported(
-    path: Path, share: float | None
-) -> None:
+def test_whatever_is_damaged_or_cut_off_it_is_read_or_reported(path: Path) -> None:
     files = [path] if path.is_file() else sorted(p for p in path.iterdir() if p.suffix != ".yaml")
     content = files[0].read_bytes()
-    changed = [damaged(content, seed) for seed in range(24)]
-    for new in changed if share is None else [content[: int(share * len(content))]]:
+    cut = [content[: int(share * len(content))] for share in (0, 0.002, 0.3, 0.9, 0.999)]
+    for new in (*cut, *(damaged(content, seed) for seed in range(12))):
         files[0].write_bytes(new)
-        with contextlib.suppress(ToftrackError):
+        try:
             store = opened(path)
-            assert share is None or path.is_dir() or len(store) <= COUNT
+            assert new not in cut or path.is_dir() or len(store) <= COUNT
             for number in range(len(store)):
                 store.image(number)
+            store.close()
+        except ToftrackError as error:
+            assert "\n" not in str(error)
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.srs", "a.npy", "a.mkv", "a.bag", "a.db3", "a"])
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.mkv", "a.bag", "a"])
 def test_what_is_not_there_is_reported(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToftrackError, match=f"there is no (file|bag) .*{name}'; give the path"):
         opened(tmp_path / name)

@@ -13,7 +13,6 @@ from helpers.videos import (
     RATIONAL,
     START_OFFSET_S,
     calibration,
-    seen_through,
     write_colour,
     write_grey,
     write_kinect,
@@ -31,7 +30,6 @@ REPORTED = BareFacts((30.0, 31.0, 15.5, 11.5))
 
 
 def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
-    """(count, *size) uint16 of all values."""
     return np.random.default_rng(count).integers(0, 0x10000, (count, *size)).astype(np.uint16)
 
 
@@ -76,28 +74,7 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
     assert (camera.width, camera.height) == size
 
 
-def test_a_plane_seen_through_a_kinects_lens_is_one_again(tmp_path: Path) -> None:
-    camera = Camera(K, 320, 288, np.array(RATIONAL))
-    pinhole = Camera(K, 320, 288)
-    plane = (0.8 / (1 + pinhole.normalised_rays() @ (0.3, 0.2))).astype(np.float32)
-    raw = np.rint(1000 * seen_through(camera, plane, pinhole)).astype(np.uint16)
-    store = open_recording(write_kinect(tmp_path / "a.mkv", raw[None], about=ABOUT))
-    z = store.camera.rectify(store.image(0)[0], store.radial)
-    inside = z > 0
-    assert inside.mean() > 0.9
-    np.testing.assert_allclose(z[inside], plane[inside], atol=0.003)
-    assert np.abs(raw / 1000 - plane)[inside].max() > 0.05
-
-
-def test_missing_infrared_is_black(tmp_path: Path, images: tuple[np.ndarray, np.ndarray]) -> None:
-    path = write_kinect(tmp_path / "a.mkv", images[0], images[1][:5], ABOUT)
-    frames = list(Replay(path))
-    assert frames[4].amplitude.any() and not frames[6].amplitude.any()
-    path = write_kinect(tmp_path / "b.mkv", images[0], None, ABOUT)
-    assert next(iter(Replay(path))).amplitude is None
-
-
-@pytest.mark.parametrize("share", [0.0, 0.001, 0.1, 0.5, 0.8, 0.95])
+@pytest.mark.parametrize("share", [0.001, 0.5, 0.95])
 def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_reported(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
 ) -> None:
@@ -126,13 +103,8 @@ def broken(change: Callable[[dict], Any]) -> dict:
     [
         (None, "no attachment calibration.json"),
         (b"{", "calibration.json.*damaged"),
-        (broken(lambda c: c["Intrinsics"].pop("ModelParameters")), "damaged"),
         (broken(lambda c: c["Intrinsics"]["ModelParameters"].pop()), "13 parameters"),
         (broken(lambda c: c.update(SensorWidth=640)), "another kind.*640"),
-        (
-            broken(lambda c: c["Intrinsics"]["ModelParameters"].__setitem__(2, -1)),
-            "positive focal lengths",
-        ),
     ],
 )
 def test_a_calibration_that_tells_no_lens_is_reported(
@@ -143,16 +115,6 @@ def test_a_calibration_that_tells_no_lens_is_reported(
         Replay(path)
     Camera(K, 320, 288).save(tmp_path / "camera.json")
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 252
-
-
-def test_a_kinects_recording_without_depth_and_of_no_mode_are_reported(tmp_path: Path) -> None:
-    ones = np.ones((1, 288, 320), np.uint16)
-    path = write_kinect(tmp_path / "a.mkv", ones, about=ABOUT, titles=("COLOR", "IR"))
-    with pytest.raises(ToftrackError, match="Azure Kinect without depth"):
-        Replay(path)
-    path = write_kinect(tmp_path / "b.mkv", ones[:, :280], about=ABOUT)
-    with pytest.raises(ToftrackError, match="320x280 pixels, which is no mode"):
-        Replay(path)
 
 
 # Videos and stacks that say nothing of themselves.
@@ -189,20 +151,9 @@ def test_a_list_of_other_files_is_no_video(tmp_path: Path, name: str) -> None:
         open_recording(tmp_path / name, bare=REPORTED)
 
 
-def test_unit_and_rate_of_a_video_can_be_given(tmp_path: Path) -> None:
-    pixels = words()
-    bare = BareFacts((30.0, 31.0, 15.5, 11.5), unit_m=0.0002, fps=10.0)
-    store = open_recording(write_grey(tmp_path / "a.mkv", pixels), bare=bare)
-    np.testing.assert_allclose(store.image(3)[0], pixels[3] * 0.0002, rtol=1e-6)
-    np.testing.assert_allclose(store.timestamp_s, np.arange(7) / 10)
-    assert store.fps == 10
-
-
 def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
     path = write_grey(tmp_path / "a.mkv", words())
-    with pytest.raises(
-        ToftrackError, match=r"32x24 pixels.*--intrinsics FX FY CX CY.*camera\.file"
-    ):
+    with pytest.raises(ToftrackError, match=r"--intrinsics FX FY CX CY.*camera\.file"):
         Replay(path)
     Camera(np.diag((30.0, 30, 1)), 32, 24).save(tmp_path / "camera.json")
     assert Replay(path).camera.K[0, 0] == 30
@@ -212,9 +163,8 @@ def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
 
 
 def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
-    for name in ("a.mkv", "a.avi", "a.mp4"):
-        with pytest.raises(ToftrackError, match="colour or 8-bit images.*mpeg4 yuv420p.*16 bits"):
-            Replay(write_colour(tmp_path / name))
+    with pytest.raises(ToftrackError, match="colour or 8-bit images.*mpeg4 yuv420p.*16 bits"):
+        Replay(write_colour(tmp_path / "a.mp4"))
     (tmp_path / "b.mp4").write_bytes(b"nonsense" * 99)
     with pytest.raises(ToftrackError, match="b.mp4' cannot be read as a video"):
         Replay(tmp_path / "b.mp4")
@@ -223,7 +173,6 @@ def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("stack", "factor"),
     [
-        (words() // 8, 0.001),
         (words().astype(np.int32) // 8, 0.001),
         (words()[0] // 8, 0.001),
         (words() / 5000, 1),
@@ -269,9 +218,3 @@ def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
         with pytest.raises(ToftrackError, match="a.npy' cannot be read") as caught:
             open_recording(tmp_path / "a.npy", bare=REPORTED)
         assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("name", ["a.oni", "a.ply", "a.png", "a.xef", "a.klg", "a.CSV"])
-def test_of_other_kinds_the_error_says_how_to_convert_them(tmp_path: Path, name: str) -> None:
-    with pytest.raises(ToftrackError, match=rf"{name}' is not read: .*(PNG|npy|folder|points)"):
-        open_recording(tmp_path / name)

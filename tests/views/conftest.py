@@ -3,14 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import pytest
 from helpers.chromium import headless_chromium
 
 
-@pytest.fixture
-def chromium(tmp_path: Path) -> Iterator:
-    """Headless Chromium under WebDriver."""
-    with headless_chromium(tmp_path / "profile") as driver:
+@pytest.fixture(scope="session")
+def _one_chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with headless_chromium(tmp_path_factory.mktemp("profile")) as driver:
         yield driver
+
+
+@pytest.fixture
+def chromium(_one_chromium: Any) -> Iterator[Any]:
+    """Headless Chromium under WebDriver, with an empty page and console."""
+    _one_chromium.get_log("browser")
+    yield _one_chromium
+    _one_chromium.get("data:,")
+    _one_chromium.set_window_size(1200, 900)
+    _one_chromium.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 import sys
@@ -24,17 +23,15 @@ from helpers.browsing import (
     eventually,
     made,
     moments,
-    numbered,
-    numbers_of,
     ours,
     shown_again_and_again,
 )
 from helpers.moments import two_hands, with_hand
 from helpers.programs import QUICK, interrupted_when
 from helpers.settings import browser_view
-from helpers.tracking import ROOT, configuration
+from helpers.tracking import configuration
 
-from toftrack.devices.replay import Replay, Sample
+from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import no_estimate
 from toftrack.output.results import read_results
 from toftrack.views.browser import view as browser
@@ -61,13 +58,12 @@ def test_frames_with_an_end_wait_for_a_visitor_but_not_for_ever(capsys, monkeypa
 
 
 def test_with_the_page_recordings_keep_their_pace_and_only_the_sample_repeats() -> None:
-    device = configuration("view=browser").device
-    assert device.realtime and device.repeat
-    device = configuration("view=browser", "device=replay", "device.path=x.npz").device
-    assert device.realtime and not device.repeat
+    recording = ("device=replay", "device.path=x.npz")
+    for given, realtime, repeat in (((), True, True), (recording, True, False)):
+        device = configuration("view=browser", *given).device
+        assert (device.realtime, device.repeat) == (realtime, repeat)
     device = configuration("view=browser", "view.live=false").device
     assert not device.realtime and not device.repeat
-    assert not configuration("device=folder", "device.path=x").device.realtime
 
 
 @pytest.fixture
@@ -89,15 +85,6 @@ def test_a_repeated_recording_counts_on(realtime: bool, clock) -> None:
         assert np.array_equal(frame.depth, later.depth)
     assert not np.array_equal(frames[0].depth, frames[1].depth)
     assert device.dropped == 0 and clock[0] == pytest.approx(7 / 25 if realtime else 0, abs=1e-3)
-
-
-def test_a_repeated_recording_drops_what_comes_too_late_over_its_end(clock) -> None:
-    device = Replay(ROOT / "toftrack/data/sample.npz", 0, 5, realtime=True, repeat=True)
-    indices = []
-    for frame in islice(device, 4):
-        indices.append(frame.index)
-        clock[0] = round(clock[0] + 0.1201, 4)  # three frames' time
-    assert indices == [0, 1, 4, 7] and device.dropped == 4  # the first one is waited for
 
 
 def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path, monkeypatch) -> None:
@@ -152,21 +139,6 @@ def view() -> Iterator[BrowserView]:
         yield view
 
 
-def test_the_page_shows_image_skeleton_and_number_of_one_frame(chromium, view) -> None:
-    found = "document.getElementById"
-    script = f"return [{found}('image').toDataURL(), {found}('index').textContent]"
-    seen = set()
-    with shown_again_and_again(view, numbered):
-        chromium.get(view.url)
-        eventually(lambda: chromium.execute_script(script)[1] != "–")
-        for _ in range(12):
-            url, index = chromium.execute_script(script)
-            shown = numbers_of(base64.b64decode(url.partition(",")[2]))
-            assert shown == 2 * ((int(index) - 1) % 8,)
-            seen.add(index)
-    assert len(seen) > 1
-
-
 def test_the_page_works_in_a_browser(chromium, view) -> None:
     def text(name: str) -> str:
         return chromium.execute_script(f"return document.getElementById('{name}').textContent")
@@ -194,9 +166,6 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         number = int(text("index"))
         eventually(lambda: all(picture(name) != old for name, old in before.items()))
         eventually(lambda: int(text("index")) > number)
-        assert text("score") in {f"{moment.estimates[0].score:.2f}" for moment in moments()}
-        assert text("ms").endswith(" ms") and text("gesture") != ""
-
         eventually(lambda: pressed() == ["Right hand"])
         press("Start again")
         eventually(lambda: taken == ["restart"])
@@ -206,9 +175,8 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
         eventually(lambda: pressed() == ["Left hand"])
         press("Either hand")
         eventually(lambda: taken[2:] == ["auto"] and pressed() == ["Either hand"])
-        assert text("latency").endswith(" ms")
 
-        for width in (1400, 500, 400):  # the last one is a phone's
+        for width in (1400, 400):  # the last one is a phone's
             size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width == 400}
             chromium.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
             wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
@@ -216,9 +184,6 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
             clipped = "return [...document.querySelectorAll('dd, #phase')].filter(shown => shown"
             clipped += ".scrollWidth > shown.clientWidth + 1).map(shown => shown.textContent)"
             assert chromium.execute_script(clipped) == []
-            cells, table = "[...document.querySelectorAll('dl > div')]", "querySelector('dl')"
-            rest = f"return document.{table}.getBoundingClientRect().right - {cells}.at(-1)"
-            assert chromium.execute_script(f"{rest}.getBoundingClientRect().right") < 3
         left, right = (chromium.find_element("id", name).rect for name in ("image", "model"))
         assert right["y"] > left["y"] + left["height"] and left["width"] > 350
     lost = no_estimate(9, 0.36, "lost", 4, 0.01)
@@ -235,13 +200,6 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     view.show(two_hands(moments()[1], side_probability=0.83, gesture="ok", pinching=True))
     eventually(lambda: of_slots("side") == ["right", "left 83 %"])
     assert of_slots("state") == ["tracking", "tracking"] and of_slots("gesture")[1] == "ok"
-    assert of_slots("pinching") == ["", "pinching"]
-    assert not chromium.find_element("id", "state").is_displayed()
-    eight = replace(moments()[1], hands=4 * two_hands(moments()[1]).hands)
-    view.show(eight)
-    eventually(lambda: of_slots("side") == 4 * ["right", "left"])
-    colours = "return [...document.querySelectorAll('.hand')].map(e => e.style.cssText)"
-    assert len(set(chromium.execute_script(colours))) == 8
     view.show(two_hands(moments()[1], lost=True))
     eventually(lambda: of_slots("state") == ["tracking", "LOST"])
     doubted = replace(moments()[1].estimates[0], joint_ok=np.arange(21) > 3)
@@ -249,21 +207,14 @@ def test_the_page_works_in_a_browser(chromium, view) -> None:
     eventually(lambda: of_slots("state") == [] and text("state") == "tracking")
     assert (text("doubted"), text("fingers")) == ("4 doubtful", "wrist, thumb")
     assert "dashed" in text("legend") and text("dropped") == "7"
-    view.show(moments()[1])
-    eventually(lambda: text("doubted") == "all ok" and text("legend") == "")
     assert chromium.get_log("browser") == []
 
     view._end("over")
     eventually(lambda: text("phase") == "the recording is over")
     assert chromium.find_element("xpath", "//button[text()='Start again']").get_property("disabled")
     view.close()
-    time.sleep(0.2)
-    assert text("phase") == "the recording is over"
-    again = browser_view("", 25.0, None, port=urlsplit(view.url).port)
-    try:
+    with closing(browser_view("", 25.0, None, port=urlsplit(view.url).port)) as again:
         again.show(moments()[0])
         eventually(lambda: text("phase") == "live")  # by itself
         again._server.close()
         eventually(lambda: text("phase") == "connection lost; trying again")
-    finally:
-        again.close()
