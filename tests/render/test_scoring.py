@@ -224,9 +224,9 @@ def test_images_of_a_pixel_s_width(back_end, size):
 # More columns than a word of bits has, one word exactly, and hardly more than one; a dilation that
 # reaches across two words; left hands; hands across the edges and behind the camera.
 INTERPRETED = [
-    (48, 64, 6.5, "left"),
-    (40, 150, 20.0, "right"),
-    (33, 65, 0.0, "left"),
+    (20, 40, 3.0, "left"),
+    (16, 150, 8.0, "right"),
+    (17, 65, 0.0, "left"),
     (1, 1, 2.0, "right"),
 ]
 

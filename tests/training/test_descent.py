@@ -15,6 +15,7 @@ import torch
 from helpers import programs
 from helpers.tracking import ROOT
 
+from toftrack.detector.crops import CROP
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
 from toftrack.detector.weights import load_weights, save_weights
@@ -23,6 +24,7 @@ from toftrack.training import batches, checkpoints, descent, images
 from toftrack.training.batches import Batches
 from toftrack.training.checkpoints import Checkpoints, Progress
 from toftrack.training.descent import Schedule, train_finder, train_poses
+from toftrack.training.shapes import ShapeBank
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -123,8 +125,14 @@ def test_a_restart_that_was_interrupted_ends_with_the_same_weights(
     assert [row["loss"] for row in course] == [row["loss"] for row in other]
 
 
+def noise(n: int, _: ShapeBank, generator: torch.Generator) -> images.WideImages:
+    """Instead of images, which take other processes seconds to begin with."""
+    drawn = torch.rand(n, 2, CROP, CROP, generator=generator)
+    return images.WideImages(drawn, drawn[:, :, 0], drawn[:, 0, 0], drawn[:, 1, 0])
+
+
 def test_batches_are_those_of_their_numbers_whichever_process_makes_them() -> None:
-    made = Batches(images.wide_images, 2, 6, 0)
+    made = Batches(noise, 2, 6, 0)
     found = list(batches.made_batches(made, range(3, 6), 2))
     assert len(found) == 3 and found[0].image.dtype == torch.float16
     for number, batch in zip(range(3, 6), found, strict=True):

@@ -7,6 +7,7 @@ import re
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,12 @@ from toftrack.errors import ToftrackError
 _ROOT = "config.yaml"
 _MOST_LETTERS = 2**16
 """In a file of the configuration."""
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _composing = threading.Lock()
+_read: dict[str, Any] = {}
+"""What texts of files mean: Hydra reads each file for every composition, which takes most of the
+time.
+"""
 
 
 def configuration(*overrides: str, config_dir: str | Path | None = None) -> DictConfig:
@@ -140,9 +146,14 @@ def modest_files() -> Iterator[None]:
     load = OmegaConf.load
 
     def checked(file: Any) -> Any:
-        if isinstance(file, io.TextIOBase):  # which Hydra alone gives
-            _check_size(file)
-        return load(file)
+        if not isinstance(file, io.TextIOWrapper):  # which Hydra alone gives
+            return load(file)
+        text = file.read(_MOST_LETTERS + 1)
+        file.seek(0)
+        if text not in _read:
+            _check_size(text, file.name)
+            _read[text] = load(file)
+        return deepcopy(_read[text])
 
     OmegaConf.load = staticmethod(checked)  # type: ignore[assignment]
     try:
@@ -151,16 +162,15 @@ def modest_files() -> Iterator[None]:
         OmegaConf.load = staticmethod(load)  # type: ignore[method-assign]
 
 
-def _check_size(file: Any) -> None:
-    """Raise ToftrackError where the text or the values are too many, an alias counted as what it
-    stands for.
+def _check_size(text: str, name: str) -> None:
+    """Raise ToftrackError where the text of a file or its values are too many, an alias counted as
+    what it stands for.
     """
-    text, count = file.read(_MOST_LETTERS + 1), 0
-    file.seek(0)
+    count = 0
     sizes: dict[str | None, int] = {}
     within: list[tuple[str | None, int]] = []
     with suppress(yaml.YAMLError):  # Hydra meets it, too, and says where
-        for event in yaml.parse(text, Loader=yaml.SafeLoader):
+        for event in yaml.parse(text, Loader=_LOADER):
             if isinstance(event, yaml.CollectionEndEvent):
                 anchor, before = within.pop()
                 sizes[anchor] = count - before + 1
@@ -170,7 +180,7 @@ def _check_size(file: Any) -> None:
                     within.append((event.anchor, count))
             if count > MOST_VALUES or len(text) > _MOST_LETTERS:
                 raise ToftrackError(
-                    f"'{file.name}' is too large for a file of the configuration (at most "
+                    f"'{name}' is too large for a file of the configuration (at most "
                     f"{MOST_VALUES} values, aliases counted as what they stand for); let your "
                     "part read a file of its own"
                 )

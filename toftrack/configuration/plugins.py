@@ -11,7 +11,7 @@ import logging
 import os
 import pkgutil
 import sys
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +41,21 @@ _LIKE = {"detector": "network", "gestures": "default", "pose_space": "pca"}
 
 def installed(group: str) -> dict[str, EntryPoint]:
     """The parts of a group in ENTRY_POINTS that installed packages bring, by their names."""
-    try:
-        found = entry_points(group=ENTRY_POINTS[group])
-    except Exception as error:  # whatever a damaged file of any package raises
-        _told(" ".join(str(error).split()))
-        return {}
+    found = _entry_points(tuple(sys.path)).select(group=ENTRY_POINTS[group])
     return {entry.name: entry for entry in found if entry.pattern.match(entry.value)}
 
 
 @functools.cache
-def _told(reason: str) -> None:
-    _log.warning("what installed packages bring is left out: an entry_points.txt says %s", reason)
+def _entry_points(_: tuple[str, ...]) -> Any:
+    """Those of all packages in the folders of sys.path, which take a while to read."""
+    try:
+        return entry_points()
+    except Exception as error:  # whatever a damaged file of any package raises
+        reason = " ".join(str(error).split())
+        _log.warning(
+            "what installed packages bring is left out: an entry_points.txt says %s", reason
+        )
+        return EntryPoints()
 
 
 def offer_installed() -> None:
