@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -16,8 +14,8 @@ from helpers.programs import hangups_are_handled as hangups_are_handled
 from helpers.tracking import CONF
 from hydra import compose, initialize_config_dir
 from hydra.utils import instantiate
+from omegaconf import OmegaConf
 
-import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 from toftrack.files.safe_files import leave_folder
@@ -29,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("hangups_are_handled")
 
 
 APP = """
-import functools, pathlib, sys, time
+import functools, pathlib, sys
 import hydra
 from hydra.utils import instantiate
 from toftrack.programs.command_line import run, sweep_job
@@ -51,9 +49,6 @@ def main(config):
         raise ToftrackError("the reason, and what to do")
     if config.fail == "unexpected":
         raise ValueError("two\\nlines")
-    if config.fail == "wait":
-        print("waiting", flush=True)
-        time.sleep(60)
     if config.fail == "late":
         folder = pathlib.Path(hydra.core.hydra_config.HydraConfig.get().runtime.output_dir)
         (folder / "summary.json").write_text('{"frames": 3}')
@@ -66,9 +61,16 @@ if __name__ == "__main__":
 """
 
 
-CALLBACK = """
-hydra: {callbacks: {failed_jobs: {_target_: toftrack.programs.command_line.FailedJobs}}}
-"""
+def test_full_errors_show_the_traceback_and_the_sentence(
+    monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def main() -> None:
+        raise ToftrackError("the reason")
+
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
+    assert run(main) == 1
+    err = capsys.readouterr().err
+    assert "Traceback" in err and "in main" in err and err.endswith("\nerror: the reason\n")
 
 
 @pytest.fixture
@@ -78,6 +80,7 @@ def app(tmp_path: Path) -> Path:
     (folder / "app.py").write_text(APP)
     (folder / "conf" / "app.yaml").write_text(
         'defaults: [_self_, {device: sample}]\nfail: ""\nseed: 1\n'
+        "hydra: {callbacks: {failed_jobs: {_target_: toftrack.programs.command_line.FailedJobs}}}\n"
     )
     (folder / "conf" / "device" / "sample.yaml").write_text(
         "_target_: toftrack.devices.replay.Sample\n"
@@ -88,34 +91,9 @@ def app(tmp_path: Path) -> Path:
     return folder
 
 
-def start(app: Path, *arguments: str, **environment: str) -> subprocess.Popen[str]:
-    root = str(Path(toftrack.__file__).parents[1])
-    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    return subprocess.Popen(
-        [sys.executable, "app.py", *arguments],
-        cwd=app,
-        env=clean | {"PYTHONPATH": root} | environment,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 def call(app: Path, *arguments: str) -> tuple[int, str, str]:
     """Within this process."""
     return programs.call(*arguments, folder=app, program=str(app / "app.py"))
-
-
-def call_process(app: Path, *arguments: str, **environment: str) -> tuple[int, str, str]:
-    process = start(app, *arguments, **environment)
-    out, err = process.communicate(timeout=60)
-    return process.returncode, out, err
-
-
-def test_a_run_without_error_exits_with_zero(app: Path) -> None:
-    status, out, err = call_process(app)
-    assert (status, err) == (0, "")
-    assert "replayed 100" in out
 
 
 @pytest.mark.parametrize(
@@ -123,10 +101,7 @@ def test_a_run_without_error_exits_with_zero(app: Path) -> None:
     [
         (["fail=clear"], "error: the reason, and what to do"),
         (["fail=unexpected"], "app.py, line 23) (HYDRA_FULL_ERROR=1 shows the traceback)"),
-        (["device=replay", "device.path=gone.npz"], "error: there is no file 'gone.npz'"),
         (["device=replay"], "device.path is missing; give it on the command line"),
-        (["device=nope"], "there is no device=nope; give one of replay, sample"),
-        (["nope=1"], "there is no setting nope; the configuration has fail, seed, device"),
         (["seed=[1"], "'seed=[1' cannot be read as a setting"),
         (["hydra.run.dir=app.py/out"], "'app.py/out' cannot be read or written"),
         (["+device.bogus=1"], "unexpected keyword argument 'bogus'"),
@@ -143,8 +118,6 @@ def test_an_error_is_one_sentence(app: Path, arguments: list[str], words: str) -
 
 def test_a_failing_run_leaves_no_folder_but_keeps_one_with_files(app: Path) -> None:
     """Whoever gives a folder that there is finds it as it was."""
-    with open(app / "conf" / "app.yaml", "a") as config:
-        config.write(CALLBACK)
     (app / "mine").mkdir()
     (app / "mine" / "notes.txt").touch()
     before = set(app.rglob("*"))
@@ -163,8 +136,6 @@ def test_a_failing_run_leaves_no_folder_but_keeps_one_with_files(app: Path) -> N
 
 def test_a_folder_into_which_a_run_is_writing_stays_as_it_is(app: Path) -> None:
     """Of two that begin at once into a new folder; the first one may not have written yet."""
-    with open(app / "conf" / "app.yaml", "a") as config:
-        config.write(CALLBACK)
     shared = app / "deep" / "shared"
     lock = own_folder(shared)
     status, out, err = call(app, "hydra.run.dir=deep/shared")
@@ -173,27 +144,6 @@ def test_a_folder_into_which_a_run_is_writing_stays_as_it_is(app: Path) -> None:
     leave_folder(lock)
     assert call(app, "fail=clear", "hydra.run.dir=deep/shared")[0] == 1, "and nobody has it still"
     assert call(app, "hydra.run.dir=deep/shared")[0] == 0 and (shared / ".hydra").exists()
-
-
-def test_full_errors_show_the_traceback_and_the_sentence(app: Path) -> None:
-    status, _, err = call_process(app, "fail=clear", HYDRA_FULL_ERROR="1")
-    assert status == 1
-    assert "Traceback" in err
-    assert "in main" in err
-    assert err.splitlines()[-1] == "error: the reason, and what to do"
-
-
-@pytest.mark.parametrize(
-    ("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
-)
-def test_a_signal_ends_with_its_status(app: Path, number: int, code: int) -> None:
-    process = start(app, "fail=wait")
-    assert process.stdout.readline() == "waiting\n"
-    process.send_signal(number)
-    _, err = process.communicate(timeout=20)
-    assert process.returncode == code
-    assert err.startswith("interrupted\n")  # nothing was done that could be kept
-    assert "Traceback" not in err
 
 
 def test_a_request_that_comes_with_the_end_of_the_terminal_gives_the_status(
@@ -215,17 +165,8 @@ def test_a_request_that_comes_with_the_end_of_the_terminal_gives_the_status(
     assert run(lambda: 1 / 0) == 1, "and of the next one nothing was asked"
 
 
-def test_who_has_read_enough_of_what_hydra_tells_is_no_error(app: Path) -> None:
-    words = (sys.executable, "-m", "toftrack", "track", "--hydra-help")
-    process = subprocess.Popen(words, cwd=app, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-    process.stdout.close()
-    assert (process.wait(60), process.stderr.read()) == (0, b"")
-
-
 @pytest.mark.parametrize("words", [["hydra.run.dir="], ["-m", "seed=1", "hydra.sweep.dir="]])
 def test_a_folder_without_a_name_is_not_the_current_one(app: Path, words: list[str]) -> None:
-    with open(app / "conf" / "app.yaml", "a") as config:
-        config.write(CALLBACK)
     before = set(app.rglob("*"))
     status, out, err = call(app, *words)
     assert (status, out) == (1, "") and "dir is empty; give a folder" in err
@@ -256,45 +197,24 @@ def test_one_failing_job_does_not_stop_the_others(app: Path) -> None:
     assert not (app / "sweep" / "3" / "summary.json").exists()
 
 
-LAUNCHER = """
-import os
-from hydra.core.config_store import ConfigStore
-from hydra.core.utils import JobReturn, JobStatus
-from hydra._internal.core_plugins.basic_launcher import BasicLauncher
+def test_jobs_that_fail_in_other_processes_are_counted(tmp_path: Path, capsys) -> None:
+    """As the launchers joblib, submitit and ray run them: their files alone tell of it."""
+    config = OmegaConf.create({"hydra": {"sweep": {"dir": str(tmp_path)}}})
 
-class ForkingLauncher(BasicLauncher):
-    \"\"\"Every job in a process that keeps to itself what it knows.\"\"\"
-    def launch(self, job_overrides, initial_job_idx):
-        for number, overrides in enumerate(job_overrides, initial_job_idx):
-            child = os.fork()
-            if not child:
-                super().launch([overrides], number)
-                os._exit(0)
-            os.waitpid(child, 0)
-        done = JobReturn(status=JobStatus.COMPLETED)
-        done.return_value = 0.0
-        return [done] * len(job_overrides)
+    def finish(number: int, **facts: object) -> None:
+        (tmp_path / str(number)).mkdir()
+        (tmp_path / str(number) / "summary.json").write_text(json.dumps(facts))
 
-ConfigStore.instance().store(
-    group="hydra/launcher",
-    name="forking",
-    node={"_target_": "hydra_plugins.forking.ForkingLauncher"},
-)
-"""
+    def main() -> None:
+        jobs = FailedJobs()
+        jobs.on_multirun_start(config)
+        for number, facts in enumerate(({"error": "no"}, {"frames": 3}, {"error": "no"})):
+            finish(number, **facts)
+        jobs.on_multirun_end(config)
 
-
-def test_jobs_that_fail_in_other_processes_are_counted(app: Path) -> None:
-    """As the launchers joblib, submitit and ray run them, which are extras."""
-    (app / "hydra_plugins").mkdir()
-    (app / "hydra_plugins" / "forking.py").write_text(LAUNCHER)
-    with open(app / "conf" / "app.yaml", "a") as config:
-        config.write(CALLBACK)
-    sweep = ("-m", "hydra/launcher=forking", "hydra.sweep.dir=sweep")
-    status, _, err = call_process(app, *sweep, "fail=clear,late,''")
-    assert status == 1 and err.splitlines()[-1] == "error: 2 of the jobs failed, see above"
-    # The folders of those that failed are there still.
-    status, _, err = call_process(app, *sweep, "seed=1", "hydra.sweep.subdir=other")
-    assert (status, err) == (0, "")
+    finish(7, error="of an earlier sweep")
+    assert run(main) == 1
+    assert capsys.readouterr().err == "error: 2 of the jobs failed, see above\n"
 
 
 def test_the_programs_count_jobs_that_failed_elsewhere() -> None:
@@ -336,9 +256,3 @@ def test_a_cause_deep_inside_is_what_is_reported() -> None:
             raise TypeError("wrapped again") from error
     except TypeError as error:
         assert sentence(error) == "the cause"
-
-
-def test_a_full_disk_is_reported_without_a_path() -> None:
-    text = sentence(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
-    assert "No space left" in text
-    assert "hydra.run.dir" in text and "standard output" in text

@@ -9,9 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from helpers.bags import DEPTH, recording, write_bag
 from helpers.tracking import ROOT
-from helpers.videos import write_grey
 
 from toftrack.devices.replay import Folder, Replay, Sample
 from toftrack.errors import ToftrackError
@@ -63,20 +61,36 @@ def test_there_and_back_is_bit_exact(srs: Path, tmp_path: Path, between: str) ->
     assert first.init == second.init or between != "between.srs"
 
 
-def test_npz_to_npz_keeps_the_truth(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    source = ROOT / "toftrack" / "data" / "sample.npz"
-    convert.convert(source, tmp_path / "copy.npz")
+def test_the_truth_is_kept_and_depth_in_a_folder_is_millimetres(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    whole = ROOT / "toftrack" / "data" / "sample.npz"
+    with np.load(whole) as sample:
+        depth = sample["depth_m"][:4]
+        few = {name: sample[name][:4] for name in ("depth_m", "amplitude", "joints_m")}
+        np.savez(tmp_path / "few.npz", K=sample["K"], **few)
+    for name in ("copy.npz", "copy.srs", "folder"):
+        convert.convert(tmp_path / "few.npz", tmp_path / name)
     assert read_recording(tmp_path / "copy.npz").truth is not None
-    convert.convert(source, tmp_path / "copy.srs")
     assert "ground truth" in capsys.readouterr().err
-
-
-def test_depth_in_a_folder_is_millimetres(tmp_path: Path) -> None:
-    convert.convert(ROOT / "toftrack" / "data" / "sample.npz", tmp_path / "folder")
     image = cv2.imread(str(tmp_path / "folder" / "depth_000003.png"), cv2.IMREAD_UNCHANGED)
-    expected = list(Sample(stop=4))[3].depth
     assert image.dtype == np.uint16
-    np.testing.assert_array_equal(image, np.rint(1000 * expected.astype(np.float64)))
+    np.testing.assert_array_equal(image, np.rint(1000 * depth[3].astype(np.float64)))
+
+
+def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path) -> None:
+    words = np.random.default_rng(0).integers(1, 5000, (3, 24, 32)).astype(np.uint16)
+    path = tmp_path / "a.npy"
+    np.save(path, words)
+    lens = ["--intrinsics", "30", "31", "15.5", "11.5"]
+    rest = ["--source-unit", "0.0005", "--fps", "12.5"]
+    convert.main([str(path), str(tmp_path / "out.npz"), *lens, *rest])
+    made = read_recording(tmp_path / "out.npz")
+    np.testing.assert_allclose(made.depth, words * 0.0005, rtol=1e-6)
+    np.testing.assert_array_equal(made.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
+    assert made.fps == pytest.approx(12.5)
+    with pytest.raises(ToftrackError, match="--intrinsics"):
+        convert.main([str(path), str(tmp_path / "other.npz")])
 
 
 def test_convert_errors(srs: Path, tmp_path: Path) -> None:
@@ -115,7 +129,7 @@ def test_what_is_there_stays_until_the_new_recording_is_whole(
     assert there.stat().st_size > 1000
 
 
-@pytest.mark.parametrize("mine", ["camera.json", "timestamps.txt", "1.tif", "depth_1.PNG"])
+@pytest.mark.parametrize("mine", ["camera.json", "depth_1.PNG"])
 def test_a_folder_that_holds_images_or_their_facts_is_left_as_it_is(
     mine: str, srs: Path, tmp_path: Path
 ) -> None:
@@ -129,39 +143,6 @@ def test_a_folder_that_holds_images_or_their_facts_is_left_as_it_is(
     assert (folder / mine).read_text() == "mine"
     (folder / mine).unlink()
     assert convert.convert(srs, folder) == 12
-
-
-@pytest.mark.parametrize("name", ["a.mkv", "a.npy", "pictures"])
-def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path, name: str) -> None:
-    words = np.random.default_rng(0).integers(1, 5000, (3, 24, 32)).astype(np.uint16)
-    path = tmp_path / name
-    if name.endswith(".mkv"):
-        write_grey(path, words)
-    elif name.endswith(".npy"):
-        np.save(path, words)
-    else:
-        path.mkdir()
-        for number, image in enumerate(words):
-            cv2.imwrite(str(path / f"{number}.png"), image)
-    lens = ["--intrinsics", "30", "31", "15.5", "11.5"]
-    rest = ["--source-unit", "0.0005", "--fps", "12.5"]
-    convert.main([str(path), str(tmp_path / "out.npz"), *lens, *rest])
-    made = read_recording(tmp_path / "out.npz")
-    np.testing.assert_allclose(made.depth, words * 0.0005, rtol=1e-6)
-    np.testing.assert_array_equal(made.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
-    assert made.fps == pytest.approx(12.5)
-    with pytest.raises(ToftrackError, match="--intrinsics"):
-        convert.main([str(path), str(tmp_path / "other.npz")])
-
-
-def test_a_topic_of_a_bag_is_converted_with_its_lens(tmp_path: Path) -> None:
-    camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.array([0.1, 0, 0, 0, 0, 0.2, 0, 0]))
-    depth = np.full((3, 24, 32), 0.7, np.float32)
-    bag = write_bag(tmp_path, "mcap", recording(depth, camera))
-    convert.main([str(bag), str(tmp_path / "out.npz"), "--topic", DEPTH])
-    made = read_recording(tmp_path / "out.npz")
-    np.testing.assert_allclose(made.depth, depth)
-    np.testing.assert_array_equal(made.camera.distortion, camera.distortion)
 
 
 def test_lens_and_polynomial_are_not_lost_in_npz(tmp_path: Path) -> None:
@@ -253,12 +234,9 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     [
         ({"image_1": np.ones((6, 9), np.uint16)}, "1.png.*9x6"),
         ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
-        ({"camera": {"fps": "fast"}}, "fps"),
-        ({"camera": {"K": [[1]]}}, "3x3"),
         ({"timestamps.txt": b"0\n1\n"}, "3 finite times"),
         ({"amplitude_1.png": PNG}, "3 depth and 1 amplitude"),
         ({"1.png": PNG[:40]}, "1.png.*damaged"),
-        ({"1.png": b""}, "1.png.*damaged"),
     ],
 )
 def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], words: str) -> None:

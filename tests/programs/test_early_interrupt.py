@@ -38,18 +38,17 @@ def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.Complete
     )
 
 
-@pytest.mark.parametrize("moment", ["hydra", "omegaconf", "toftrack.devices.replay", "torch"])
-def test_an_interrupt_while_tracking_is_loaded(tmp_path: Path, moment: str) -> None:
-    words = (str(ROOT / "track.py"), "view=none", f"hydra.run.dir={tmp_path / 'run'}")
+@pytest.mark.parametrize(
+    ("moment", "words"),
+    [
+        ("torch", [str(ROOT / "track.py"), "view=none"]),
+        ("hydra", ["-m", "toftrack", "record", "x"]),
+    ],
+)
+def test_an_interrupt_while_a_program_is_loaded(
+    tmp_path: Path, moment: str, words: list[str]
+) -> None:
     reported = interrupted(tmp_path, moment, *words)
-    assert reported.returncode == 130, reported.stderr
-    assert "Traceback" not in reported.stderr and "interrupted" in reported.stderr
-
-
-@pytest.mark.parametrize("name", ["track", "record", "report", "benchmark"])
-def test_an_interrupt_while_another_command_is_loaded(tmp_path: Path, name: str) -> None:
-    moment = "toftrack.evaluation.speed" if name == "benchmark" else "hydra"
-    reported = interrupted(tmp_path, moment, "-m", "toftrack", name, "x")
     assert reported.returncode == 130 and reported.stderr.startswith("interrupted")
     assert reported.stderr.count("\n") == 1
 
@@ -64,11 +63,3 @@ def test_an_ignored_interrupt_stays_ignored(tmp_path: Path) -> None:
     finally:
         signal.signal(signal.SIGINT, before)
     assert reported.returncode == 1 and "no folder" in reported.stderr
-
-
-def test_the_library_leaves_interrupts_alone() -> None:
-    words = "import signal, toftrack; toftrack.make_device; print(signal.getsignal(signal.SIGINT))"
-    reported = subprocess.run(
-        [sys.executable, "-c", words], cwd=ROOT, capture_output=True, text=True
-    )
-    assert "default_int_handler" in reported.stdout
