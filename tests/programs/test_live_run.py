@@ -53,15 +53,6 @@ def test_a_run_that_was_too_slow_says_so(tmp_path: Path, capsys: pytest.CaptureF
     assert "16, 0 of them lost, 12 dropped" in out
 
 
-def test_a_recording_at_its_own_pace_is_told_how_to_be_seen_whole(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
-    device = Late(every=5, live=True)
-    device.description |= {"realtime": True, "repeat": False}
-    run(tmp_path, device, *OVERRIDES)
-    assert "device.repeat=true plays it on and on" in capsys.readouterr().err
-
-
 def test_of_a_recording_nothing_of_that_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:

@@ -17,7 +17,6 @@ from helpers.tracking import run
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.realsense.device import load_sdk
 from toftrack.devices.replay import Replay, Sample
-from toftrack.devices.synthetic import Synthetic
 from toftrack.errors import ToftrackError
 from toftrack.frames.frame import Frame
 from toftrack.programs import command_line, recover
@@ -51,11 +50,7 @@ def an_sr3000(monkeypatch: pytest.MonkeyPatch) -> Device:
     return sr3000(transport="emulated", keep="every", stop=FEW, emulated=emulated)
 
 
-def a_synthetic_one(monkeypatch: pytest.MonkeyPatch) -> Device:
-    return Synthetic(frames=FEW)
-
-
-CAMERAS = (a_realsense, an_orbbec, an_sr3000, a_synthetic_one)
+CAMERAS = (a_realsense, an_orbbec, an_sr3000)
 
 
 class Watched(BaseDevice):

@@ -89,14 +89,6 @@ def test_what_jobs_say_cannot_command_the_terminal(sweep: Path, capsys) -> None:
     assert "no hand ]0;mine" in text and "[31m" in text and "\x1b" not in text
 
 
-def test_a_sweep_in_which_all_failed_is_still_reported(sweep: Path, capsys) -> None:
-    for path in sweep.glob("*/summary.json"):
-        path.write_text('{"error": "no camera"}')
-    main([str(sweep)])
-    assert "8 of 8 jobs failed" in capsys.readouterr().out
-    assert not (sweep / "sweep.png").exists()
-
-
 def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
     job(tmp_path, 0, ["seed=0"], None)
     job(tmp_path, 1, ["seed=1"], None)
@@ -136,7 +128,7 @@ def test_a_folder_without_jobs_is_one_clear_error(tmp_path: Path) -> None:
         main([str(tmp_path / "nothing")])
 
 
-@pytest.mark.parametrize("error", [0.0, 0.004, 12.0, 3e4])
+@pytest.mark.parametrize("error", [0.0, 3e4])
 def test_the_plot_holds_errors_of_any_size(error: float) -> None:
     points = [("one", 20.0, error, None), ("two", 20.0, error, error / 2), ("three", 0.0, 1.0, 0)]
     picture = sweep_figure(points, "mm")
