@@ -9,7 +9,6 @@ from pathlib import Path
 
 import pytest
 import yaml
-from helpers import programs
 from helpers.tracking import CONF, ROOT
 from omegaconf import OmegaConf
 
@@ -22,43 +21,28 @@ from toftrack.programs.main import main
 
 WRONG = [
     ("detector.hypotheses=0", "detector.hypotheses=0 is not possible; give a whole number above 0"),
-    (
-        "filter.spread.depth_m=-0.1",
-        "filter.spread.depth_m=-0.1 is not possible; give a number of at",
-    ),
-    ("filter.particles=many", "filter.particles=many is not possible; give a whole number"),
     ("filter.particles=10000000", "filter.particles=10000000 is not possible"),
-    ("filter.particles=1e7", "filter.particles=10000000.0 is not possible"),
-    ("filter.passes=1000000000", "filter.passes=1000000000 is not possible"),
     ("filter.exponent=nan", "filter.exponent=nan is not possible; give a number"),
-    ("refine.point_m=[1]", "refine.point_m=[1] is not possible; give a number"),
     ("device.repeat=5", "device.repeat=5 is not possible; give true or false"),
     ("hands=9", "hands=9 is not possible; give a whole number above 0 and at most 8"),
     (f"seed={10**23}", "is not possible"),
-    ("seed=-1", "seed=-1 is not possible"),
-    (".".join("a" * 5000) + "=1", ""),
     ("seed=" + "[" * 3000 + "]" * 3000, ""),
     ("+seed.x=" + "{a:" * 400 + "1" + "}" * 400, ""),
     # What was probably meant.
     ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),
     ("particles=3", "did you mean filter.particles?"),
     ("devcie=replay", "there is no setting devcie; did you mean device?"),
-    ("device=realsense device.path=a.bag", "its recordings are given as device.bag=FILE"),
-    ("device=orbbec device.path=a.bag", "its recordings are given as device.bag=FILE"),
     ("device=sr3000 device.path=a.npz", "by its name alone: toftrack track FILE"),
     ("view.quux=1", "there is no setting view.quux; view has "),
     ("quux=1", "there is no setting quux; the configuration has device, "),
     ("device.path=a.npz", "a recording is given by its name alone: toftrack track FILE"),
     ("device=replya", "there is no device=replya; did you mean device=replay? The choices are"),
     ("pose_space=kpca", "there is no pose_space=kpca; did you mean pose_space=kernel_pca?"),
-    ("pose_space=pca,lle", "pose_space=pca,lle has several values; give one"),
     ("seed=range(0,3)", "has several values; give one (toftrack track -m"),
-    ("view=browser,window", "view=browser,window has several values; give one (toftrack"),
     ("device=replay device.intrinsics=5,5,3,2", "give one, or a list, 'device.intrinsics=[5,5,3"),
     ("device=replay device.K=[5,5,3,2]", "no setting device.K; did you mean device.intrinsics?"),
     ("view=web", "did you mean view=browser?"),
     ("pose_space.file=a.npz pose_space.data=natural", "data=natural is of learning, and pose_"),
-    ("view=quux", "there is no view=quux; give one of browser, none, rerun, video"),
     ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
     (
         "start=rough",
@@ -69,16 +53,8 @@ WRONG = [
     # Parts of two trackers do not mix.
     ("detector=none", "detector=none belongs to experiment=paper, the tracker without networks; "),
     (
-        "lost=never",
-        "lost=never belongs to experiment=paper; give experiment=paper as well, or leave",
-    ),
-    (
         "experiment=paper lost=calibrated",
         "lost=calibrated goes with these alone; leave lost=calibrated out",
-    ),
-    (
-        "experiment=paper refine=gauss_newton",
-        "refine=gauss_newton goes with these alone; leave refine=gauss_newton out",
     ),
 ]
 
@@ -95,13 +71,10 @@ def test_what_cannot_be_meant_is_refused_in_one_sentence(overrides: str, words: 
     "overrides",
     [
         ("filter.exponent=30", "filter.particles=100"),  # a whole number is a number
-        ("view=browser", "view.linger_s=inf"),
-        ("experiment=paper", "filter.particles=10"),
         ("segmentation.reach_m=inf",),
         ("detector.merit=-4",),
         ("device=sr3000", "device.persistence.give_up_s=null", "+device.usb.registers={3: 20}"),
         ("experiment=paper", "start.pose=[0,0,0.4,0,0,0]", "detector=none", "start=rough"),
-        ("refine=none", "detector.places=1", "posterior.keypoints=0"),
         ("+device.anything=-1",),
         ("~device.repeat",),
         ("gestures.file=mine.csv", "device.stop=5"),
@@ -152,25 +125,22 @@ def test_what_is_wrong_in_a_folder_of_ones_own_is_named(
 
 
 @pytest.mark.parametrize(
-    "text",
+    ("name", "text"),
     [
-        "a: [",
-        "defaults: 5",
-        "a: ${ 5://b}",
-        "seed: " + "9" * 5000,
-        "[" * 3000,
-        "1: 2",
+        ("config.yaml", "defaults: 5"),
+        ("config.yaml", "1: 2"),
+        ("config.yaml", "[" * 1000),
+        ("device/raw.yaml", "a: ["),
+        ("device/raw.yaml", "a: ${ 5://b}"),
+        ("device/raw.yaml", "seed: " + "9" * 5000),
     ],
+    ids=lambda text: text[:15],
 )
-@pytest.mark.parametrize("name", ["config.yaml", "device/raw.yaml"])
 def test_a_configuration_that_is_damaged_is_one_sentence(tmp_path, name: str, text: str) -> None:
     (tmp_path / "device").mkdir()
     (tmp_path / "device" / "raw.yaml").write_text("gain: 1\n")
     (tmp_path / "config.yaml").write_text("defaults:\n  - device: raw\n  - _self_\nseed: 0\n")
     (tmp_path / name).write_text(text)
-    if (name, text) == ("device/raw.yaml", "1: 2"):
-        assert configuration("seed=1", config_dir=tmp_path).seed == 1
-        return
     with pytest.raises(ToftrackError) as error:
         configuration("seed=1", config_dir=tmp_path)
     assert str(error.value) and "\n" not in str(error.value)
@@ -184,8 +154,6 @@ def test_the_file_that_is_no_yaml_is_named(tmp_path: Path, content: bytes, words
     (tmp_path / "device" / "mine.yaml").write_bytes(content)
     with pytest.raises(ToftrackError, match=f"device/mine.yaml' cannot be read as YAML.*{words}"):
         configuration("device=mine", config_dir=tmp_path)
-    status, _, err = programs.call("--config-dir", ".", "device=mine", folder=tmp_path)
-    assert status == 1 and "device/mine.yaml' cannot be read as YAML" in err and words in err
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:
@@ -220,21 +188,17 @@ def test_every_setting_of_the_tables_is_one() -> None:
     ],
     ids=["aliases", "values", "letters"],
 )
-@pytest.mark.parametrize("run", [False, True])
 def test_a_file_that_is_large_or_grows_by_its_aliases_is_refused_at_once(
-    text: str, run: bool, tmp_path: Path, capsys: pytest.CaptureFixture
+    text: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     (tmp_path / "stream").mkdir()
     (tmp_path / "stream" / "mine.yaml").write_text(f"_target_: mine.Stream\n{text}")
-    if run:
-        assert main(["track", "--config-dir", str(tmp_path), "stream=mine", "--cfg", "job"]) == 1
-        said = capsys.readouterr().err
-    else:
-        with pytest.raises(ToftrackError) as error:
-            configuration("stream=mine", config_dir=tmp_path)
-        said = str(error.value)
+    assert main(["track", "--config-dir", str(tmp_path), "stream=mine", "--cfg", "job"]) == 1
+    said = capsys.readouterr().err
     assert "mine.yaml' is too large for a file of the configuration" in said
-    assert said.count("\n") == run
+    assert said.count("\n") == 1
+    with pytest.raises(ToftrackError, match="is too large"):
+        configuration("stream=mine", config_dir=tmp_path)
 
 
 def test_aliases_and_anchors_of_usual_size_are_read(tmp_path: Path) -> None:
@@ -250,23 +214,18 @@ def test_aliases_and_anchors_of_usual_size_are_read(tmp_path: Path) -> None:
     [("''", "${v{0}}${v{0}}"), ("[1]", "[${v{0}},${..v{0}}]"), ("x", "${oc.select:v{0}}${v{0}}")],
     ids=["texts", "lists", "resolvers"],
 )
-@pytest.mark.parametrize("run", [False, True])
 def test_interpolations_that_grow_by_one_another_are_refused_at_once(
-    first: str, doubled: str, run: bool, tmp_path: Path, capsys: pytest.CaptureFixture
+    first: str, doubled: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     rising = [f"+v{i}='{doubled.replace('{0}', str(i - 1))}'" for i in range(1, 29)]
     overrides = [f"+v0={first}", *(one.replace("'", "") if "[" in one else one for one in rising)]
-    if run:
-        folder = tmp_path / "runs"
-        assert main(["track", *overrides, f"hydra.run.dir={folder}/${{v28}}"]) == 1
-        said = capsys.readouterr().err
-        assert not folder.exists()
-    else:
-        with pytest.raises(ToftrackError) as error:
-            configuration(*overrides)
-        said = str(error.value)
-    assert "interpolations (${...}) make the configuration too large" in said
-    assert said.count("\n") == run
+    folder = tmp_path / "runs"
+    assert main(["track", *overrides, f"hydra.run.dir={folder}/${{v28}}"]) == 1
+    said = capsys.readouterr().err
+    assert "make the configuration too large" in said and said.count("\n") == 1
+    assert not folder.exists()
+    with pytest.raises(ToftrackError, match="too large"):
+        configuration(*overrides)
 
 
 def test_interpolations_that_refer_to_each_other_now_and_then_are_none_too_many() -> None:

@@ -100,9 +100,7 @@ def test_convert_errors(srs: Path, tmp_path: Path) -> None:
         ((srs, tmp_path / "there.npz"), "exists already"),
         ((srs, tmp_path / "a.bag"), "neither"),
         ((srs, srs), "itself"),
-        ((tmp_path / "no.srs", tmp_path / "a.npz"), "no file"),
         ((srs, tmp_path / "a.npz", tmp_path / "camera.json"), "8x6"),
-        ((srs, tmp_path / "a.npz", None, 25), "25 MHz"),
         ((srs, tmp_path / "a", None, 20, 2.0), "--unit"),
         (
             (srs, tmp_path / "b", tmp_path / "camera.json", 20, None, False, None, REPORTED),
@@ -233,7 +231,6 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     ("changes", "words"),
     [
         ({"image_1": np.ones((6, 9), np.uint16)}, "1.png.*9x6"),
-        ({"camera": {"depth_unit_m": 0}}, "depth_unit_m"),
         ({"timestamps.txt": b"0\n1\n"}, "3 finite times"),
         ({"amplitude_1.png": PNG}, "3 depth and 1 amplitude"),
         ({"1.png": PNG[:40]}, "1.png.*damaged"),
