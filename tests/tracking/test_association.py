@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -71,17 +69,6 @@ def test_as_many_tracks_as_possible_have_a_detection_and_none_an_impossible_one(
         best = bounded[linear_sum_assignment(bounded)]
         assert len(pairs) == (best < 1e3).sum()
         assert sum(cost[pair] for pair in pairs) == pytest.approx(best[best < 1e3].sum())
-
-
-def test_to_track_hands_no_optimiser_is_loaded() -> None:
-    """For matrices of a few rows, scipy.optimize would be 146 modules."""
-    code = """
-import sys, numpy, toftrack
-tracker = toftrack.make_tracker("filter.particles=20", "gestures=none")
-tracker.step(numpy.full((144, 176), 0.6, numpy.float32), numpy.diag([200.0, 200, 1]))
-sys.exit("scipy.optimize" in sys.modules)
-"""
-    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_a_detection_costs_the_more_the_farther_it_is_and_none_is_beyond_the_gate() -> None:
