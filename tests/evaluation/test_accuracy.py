@@ -173,6 +173,7 @@ def test_an_ablation_has_the_differences_of_each_variant(folder, tmp_path, capsy
 
 
 def test_the_variants_are_of_settings_that_there_are() -> None:
+    config = configuration()
     for variant in accuracy.VARIANTS.values():
         given = (one.partition("=")[0] for one in variant.overrides)
-        assert all(OmegaConf.select(configuration(), key) is not None for key in given)
+        assert all(OmegaConf.select(config, key) is not None for key in given)
