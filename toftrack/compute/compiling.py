@@ -113,7 +113,8 @@ def _only_one_process(cache_path: str | None) -> Iterator[None]:
     beside = filelock.FileLock(f"{cache_path}.lock", timeout=_PATIENCE_S)
     try:
         beside.acquire()
-    except (OSError, NotImplementedError) as error:  # or it took too long: both compile
+    except (OSError, NotImplementedError) as error:
+        # No locks on this file system, or the other one took too long: both compile.
         log.debug(f"'{beside.lock_file}' cannot be locked ({error})")
     try:
         yield

@@ -30,6 +30,7 @@ _ROOT = "config.yaml"
 _MOST_LETTERS = 2**16
 """In a file of the configuration."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The fast one where PyYAML was built with libyaml."""
 _composing = threading.Lock()
 _read: dict[str, Any] = {}
 """What texts of files mean: Hydra reads each file for every composition, which takes most of the
