@@ -17,7 +17,7 @@ from toftrack.detector.hand_detector import NO_DETECTION
 from toftrack.errors import ToftrackError
 from toftrack.frames.frame import DepthImage
 from toftrack.tracking.sides import (
-    body_offset_m,
+    body_log_odds,
     changes_side,
     compare_sides,
     comparison_due,
@@ -28,6 +28,8 @@ from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 SMALL = ("filter.particles=80",)
+ARM = np.array([-0.1, 0.0, 0.5]), np.array([0.0, 0.8, 0.6])
+"""Of a hand that is held out to the camera."""
 
 
 def first(count: int = 12) -> Scene:
@@ -36,7 +38,7 @@ def first(count: int = 12) -> Scene:
 
 def known(fits: float = 0.0, side: str = "right", **changes: object) -> Track:
     """A track with evidence for a right hand."""
-    names = {"body_m", "comparisons", "age_s"}
+    names = {"body", "comparisons", "age_s"}
     evidence = {name: changes.pop(name) for name in names & set(changes)}
     return track_of(hand_at(), side=side, evidence=SideEvidence(fits, **evidence), **changes)
 
@@ -73,12 +75,10 @@ def test_a_hand_that_is_seen_alone_is_rather_of_the_side_that_the_user_said() ->
     assert odds_of(known(-6.0), [], "right") < 0, "but what is seen may say otherwise"
 
 
-def test_where_no_side_was_said_the_body_counts_a_little() -> None:
-    beside, far = (odds_of(known(body_m=body_m), [], None) for body_m in (0.05, 5.0))
-    assert 0 < beside < far < 2
-    assert odds_of(known(body_m=-0.05), [], None) == pytest.approx(-beside)
-    told = [odds_of(known(body_m=body_m), [], "left") for body_m in (0.0, 0.3)]
-    assert told[0] == pytest.approx(told[1])
+def test_the_place_of_the_body_counts_beside_what_the_user_said() -> None:
+    for told in (None, "right", "left"):
+        here, without = (odds_of(known(body=body), [], told) for body in (0.5, 0.0))
+        assert here == pytest.approx(without + 0.5)
 
 
 # When they are compared, and what it says.
@@ -109,7 +109,7 @@ def compared(side: str, image_side: str, **evidence: float) -> SideEvidence:
     image, here = image_of(hand_at(), side=image_side), hand_at()
     track = known(side=side, **evidence)
     view = view_of(image, track, detection_of(here, side=side), model=model)
-    return compare_sides(view, detection_of(here, side=OTHER_SIDE[side]), image, None)
+    return compare_sides(view, detection_of(here, side=OTHER_SIDE[side]), image, ARM)
 
 
 @pytest.mark.parametrize("image_side", ["right", "left"])
@@ -133,22 +133,34 @@ def test_without_a_hand_that_is_surely_there_nothing_is_learned() -> None:
     unsure = replace(detection_of(hand_at()), present=0.3)
     for detection in (unsure, NO_DETECTION):
         view = view_of(image_of(hand_at()), track, detection, model=any_hand_model())
-        assert compare_sides(view, unsure, image_of(), None) == track.evidence
+        assert compare_sides(view, unsure, image_of(), ARM) == track.evidence
 
 
-def test_a_body_is_seen_beside_the_hand_only_where_it_is_large_and_near_enough() -> None:
+def place(
+    body_m: float, columns: slice, along: tuple[float, float, float] = (0, 0.8, 0.6)
+) -> float:
+    """Of a body at some columns, how far it is to the right of the elbow."""
     k = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
-    centre = np.array([-0.1, 0.0, 0.5])
+    depth = np.zeros((144, 176), np.float32)
+    depth[40:, columns] = body_m
+    return body_log_odds(DepthImage(depth, k, 0, 0.0), (ARM[0], np.array(along)))
 
-    def place(body_m: float, columns: slice) -> float:
-        depth = np.zeros((144, 176), np.float32)
-        depth[40:, columns] = body_m
-        return body_offset_m(DepthImage(depth, k, 0, 0.0), centre)
 
-    assert place(0.8, slice(60, 150)) > 0.1, "to the right of the hand"
-    assert place(0.8, slice(0, 20)) < 0.0, "to the left of it"
+def test_a_body_is_seen_beside_the_arm_only_where_it_is_large_and_near_enough() -> None:
+    assert 1 < place(0.8, slice(60, 150)) < 4, "to the right of the elbow"
+    assert place(0.8, slice(0, 20)) < -0.5, "to the left of it"
     assert place(3.0, slice(60, 150)) == 0.0, "a wall far behind"
     assert place(0.8, slice(60, 62)) == 0.0, "a pole"
+
+
+def test_the_elbow_tells_whose_arm_it_is_and_the_hand_a_little_where_it_comes_from_the_camera() -> (
+    None
+):
+    """A hand in front of the other side of the body is the elbow's all the same."""
+    body = slice(10, 90)  # about the hand
+    assert place(0.8, body, (-0.8, 0.0, 0.6)) > 1 and place(0.8, body, (0.8, 0.0, 0.6)) < -1
+    worn = [place(0.8, slice(60, 150), (x, 0.5, -0.3)) for x in (-0.8, 0.8)]
+    assert worn[0] == worn[1] and 0 < worn[0] <= 1
 
 
 @pytest.mark.parametrize(

@@ -9,13 +9,11 @@ from functools import partial
 import numpy as np
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.crops import CROP_M
 from toftrack.detector.hand_detector import Detection, merit
-from toftrack.detector.parts import FOREARM_PART
 from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.confidence import log_odds
-from toftrack.tracking.scene import Scene
+from toftrack.tracking.scene import Arm, Scene
 from toftrack.tracking.sides import comparison_due
 from toftrack.tracking.state import NO_PLACES, OTHER_SIDE, TrackerState
 
@@ -159,29 +157,19 @@ def _elsewhere(
     return seen if tracks or state.told else held_out_first(seen)
 
 
-Arm = tuple[np.ndarray, np.ndarray]
-"""A wrist, and the direction of the forearm from there, (3,) each."""
-
-
 def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[Arm]:
     """The arms of detected hands, but for those of low merit, and of reliable tracks that nobody
-    looked at: towards what the pose network calls a forearm, else away from the fingers.
+    looked at.
     """
-    arms = []
-    for one in seen:
-        if merit(one.detection, one.detection.heat) < scene.model.detector.settings.merit:
-            continue
-        wrist = one.detection.keypoints.points_m[0].numpy()
-        near = scene.near(wrist, CROP_M / 2)
-        forearm = near[one.detection.parts.at(near) == FOREARM_PART]
-        arms.append((wrist, forearm.mean(0) - wrist if len(forearm) else -one.detection.up))
+    least = scene.model.detector.settings.merit
+    detections = [one.detection for one in seen]
+    arms = [scene.arm(one) for one in detections if merit(one, one.heat) >= least]
     looked = {one.row for one in seen}
-    arms += [
-        (hand.joints_m[0].numpy(), -hand.up_m[0])
+    return arms + [
+        (hand.joints_m[0].numpy(), -hand.up_m[0] / max(float(np.linalg.norm(hand.up_m[0])), 1e-6))
         for row, hand in enumerate(scene.hands)
         if row not in looked and hand.track.reliable
     ]
-    return [(wrist, to / max(float(np.linalg.norm(to)), 1e-6)) for wrist, to in arms]
 
 
 def _is_on(arm: Arm, detection: Detection) -> bool:

@@ -10,6 +10,9 @@ import numpy as np
 import torch
 
 from toftrack.compute.compiling import entry_point
+from toftrack.detector.crops import CROP_M
+from toftrack.detector.hand_detector import Detection
+from toftrack.detector.parts import FOREARM_PART
 from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import range_image
 from toftrack.render.segmentation import Expected, Observation, reduce_image
@@ -24,6 +27,10 @@ _FAR_M = 5.0
 """Depth of removed pixels: the detector sees nothing so far away."""
 _IN_FRONT_M = 0.03
 """What is nearer than a hand's wrist by more than this may hide the hand."""
+
+
+Arm = tuple[np.ndarray, np.ndarray]
+"""A wrist (3,), and the direction (3,) of the forearm from there, of length 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,7 +117,17 @@ class Scene:
         _remove(self.image.depth_m, pixels, np.float32(_FAR_M), depth_m)
         return replace(self.image, depth_m=depth_m)
 
-    def near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
+    def arm(self, detection: Detection) -> Arm:
+        """The arm of a detected hand: towards what the pose network calls a forearm, else away from
+        the fingers.
+        """
+        wrist = detection.keypoints.points_m[0].numpy()
+        near = self._near(wrist, CROP_M / 2)
+        forearm = near[detection.parts.at(near) == FOREARM_PART]
+        along = forearm.mean(0) - wrist if len(forearm) else -detection.up
+        return wrist, along / max(float(np.linalg.norm(along)), 1e-6)
+
+    def _near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
         """(P, 3) m, the image's points within radius_m along each axis of a point (3,)."""
         row, column = np.nonzero(np.abs(self.depth_m - centre_m[2]) < radius_m)
         points = _points_at(row, column, self.depth_m, self.k)

@@ -40,12 +40,12 @@ class SideEvidence:
     """Evidence for a hand's side, from comparisons; see sides.py.
 
     fits: log odds of a right hand, summed up over the comparisons.
-    body_m: how far the body is to the image's right of the hand, on average.
+    body: the same of where a body is beside the arm, their mean.
     comparisons: how many there were.  age_s: how long ago the last one was.
     """
 
     fits: float = 0.0
-    body_m: float = 0.0
+    body: float = 0.0
     comparisons: int = 0
     age_s: float = math.inf
 

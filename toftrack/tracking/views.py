@@ -118,7 +118,8 @@ def make_view(
 
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
     """The view with its sides compared; restarted as the other side where that one is likelier."""
-    evidence = compare_sides(view, mirrored, scene.image_for(row), told)
+    arm = scene.arm(view.detection)
+    evidence = compare_sides(view, mirrored, scene.image_for(row), arm)
     track, tracks = changed(view.track, evidence=evidence), [hand.track for hand in scene.hands]
     if not changes_side(track, side_log_odds(track, tracks, told), told):
         return replace(view, track=track)
