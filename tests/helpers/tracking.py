@@ -5,6 +5,7 @@ The recording is rendered from a mesh, by a renderer that is not ours, and carri
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -15,6 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from toftrack.api import build_tracker
+from toftrack.configuration.compose import modest_files
 from toftrack.devices.base import Device
 from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import Estimate
@@ -80,14 +82,20 @@ def sample() -> Scene:
 
 def configuration(*overrides: str, name: str = "config") -> DictConfig:
     """The configuration of `python track.py` with overrides."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    return deepcopy(_composed(name, *overrides))
+
+
+@cache
+def _composed(name: str, *overrides: str) -> DictConfig:
+    """Composing takes half a second, and most tests ask for the same as others."""
+    with modest_files(), initialize_config_dir(str(CONF), version_base="1.3"):
         return compose(name, overrides=list(overrides))
 
 
 def run(folder: Path, device: Device, *overrides: str) -> None:
     """What `python track.py` does with overrides and an opened device, in this process."""
     hydra = (f"hydra.runtime.output_dir={folder}", "hydra.job.num=0", "hydra.job.id=0")
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with modest_files(), initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[*overrides, *hydra], return_hydra_config=True)
     HydraConfig.instance().set_config(config)
     try:
