@@ -89,6 +89,7 @@ def test_its_own_error_is_reported_in_one_sentence(
     [
         ("yield None", "a device must yield Frame(index, timestamp_s, "),
         ("raise OSError(19, 'No such device')", "No such device, in RawImages"),
+        ("open('gain.txt')", "'gain.txt': No such file or directory, in RawImages"),
     ],
 )
 def test_what_goes_wrong_is_told_with_the_place_and_what_came_before_is_kept(

@@ -221,14 +221,9 @@ def test_images_of_a_pixel_s_width(back_end, size):
     assert sum(expected.correct) + sum(expected.false) > 0
 
 
-# More columns than a word of bits has, one word exactly, and hardly more than one; a dilation that
-# reaches across two words; left hands; hands across the edges and behind the camera.
-INTERPRETED = [
-    (20, 40, 3.0, "left"),
-    (16, 150, 8.0, "right"),
-    (17, 65, 0.0, "left"),
-    (1, 1, 2.0, "right"),
-]
+# Many more columns than a word of bits has, hardly more, and one; a dilation that reaches across
+# two words, and none; left hands; hands across the edges and behind the camera.
+INTERPRETED = [(16, 150, 8.0, "right"), (17, 65, 3.0, "left"), (1, 1, 0.0, "right")]
 
 
 def test_triton_agrees_as_far_as_its_interpreter_goes():

@@ -97,8 +97,9 @@ def _one_line(text: str) -> str:
 
 def _of_system(error: OSError) -> str:
     reason = error.strerror or _one_line(str(error)) or type(error).__name__
-    if error.filename is None and (place := place_of(error)):  # as of a camera that is gone
-        return f"{reason}{place} ({FULL_ERROR}=1 shows the traceback)"
+    if place := place_of(error):  # as of a camera that is gone, or a file that it needs
+        file = "" if error.filename is None else f"'{os.fsdecode(error.filename)}': "
+        return f"{file}{reason}{place} ({FULL_ERROR}=1 shows the traceback)"
     if error.filename is None:
         return (
             f"{reason}; free what is needed, or have standard output, or the files of a run "
