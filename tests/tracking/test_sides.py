@@ -136,10 +136,10 @@ def test_without_a_hand_that_is_surely_there_nothing_is_learned() -> None:
         assert compare_sides(view, unsure, image_of(), ARM) == track.evidence
 
 
-def place(
+def by_body(
     body_m: float, columns: slice, along: tuple[float, float, float] = (0, 0.8, 0.6)
 ) -> float:
-    """Of a body at some columns, how far it is to the right of the elbow."""
+    """Log odds of a right hand by a body at some columns."""
     k = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
     depth = np.zeros((144, 176), np.float32)
     depth[40:, columns] = body_m
@@ -147,19 +147,17 @@ def place(
 
 
 def test_a_body_is_seen_beside_the_arm_only_where_it_is_large_and_near_enough() -> None:
-    assert 1 < place(0.8, slice(60, 150)) < 4, "to the right of the elbow"
-    assert place(0.8, slice(0, 20)) < -0.5, "to the left of it"
-    assert place(3.0, slice(60, 150)) == 0.0, "a wall far behind"
-    assert place(0.8, slice(60, 62)) == 0.0, "a pole"
+    assert 1 < by_body(0.8, slice(60, 150)) < 4, "to the right of the elbow"
+    assert by_body(0.8, slice(0, 20)) < -0.5, "to the left of it"
+    assert by_body(3.0, slice(60, 150)) == 0.0, "a wall far behind"
+    assert by_body(0.8, slice(60, 62)) == 0.0, "a pole"
 
 
-def test_the_elbow_tells_whose_arm_it_is_and_the_hand_a_little_where_it_comes_from_the_camera() -> (
-    None
-):
+def test_the_elbow_tells_whose_arm_it_is_but_the_hand_where_it_comes_from_the_camera() -> None:
     """A hand in front of the other side of the body is the elbow's all the same."""
     body = slice(10, 90)  # about the hand
-    assert place(0.8, body, (-0.8, 0.0, 0.6)) > 1 and place(0.8, body, (0.8, 0.0, 0.6)) < -1
-    worn = [place(0.8, slice(60, 150), (x, 0.5, -0.3)) for x in (-0.8, 0.8)]
+    assert by_body(0.8, body, (-0.8, 0.0, 0.6)) > 1 and by_body(0.8, body, (0.8, 0.0, 0.6)) < -1
+    worn = [by_body(0.8, slice(60, 150), (x, 0.5, -0.3)) for x in (-0.8, 0.8)]
     assert worn[0] == worn[1] and 0 < worn[0] <= 1
 
 
