@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
+from toftrack.compute.collector import collector_paused
 from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.errors import ToftrackError
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from toftrack.tracking.tracker import HandsTracker, Tracker
 
 
+@collector_paused()
 def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Tracker:
     """A tracker of one hand as `python track.py` with these overrides has it:
     `tracker.step(depth_m, K)`.
@@ -44,6 +46,7 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
         return build_tracker(config)
 
 
+@collector_paused()
 def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) -> HandsTracker:
     """A tracker whose `step` gives a tuple of estimates, one for each of the N slots of `hands=N`.
 

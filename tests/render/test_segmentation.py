@@ -193,6 +193,19 @@ def test_a_reduced_image_shows_the_same_surface_in_the_same_place(factor: int) -
     assert depth[int(back[1].round()), int(back[0].round())] == pytest.approx(small[7, 9])
 
 
+@pytest.mark.parametrize("size", [(143, 260), (240, 320), (20, 3000)])
+def test_a_reduced_image_is_opencvs_median_in_the_middle_of_each_block(
+    size: tuple[int, int],
+) -> None:
+    generator = np.random.default_rng(0)
+    depth = generator.random(size, np.float32) * (generator.random(size) > 0.3)
+    small, _ = reduce_image(depth, np.eye(3), 3000)
+    factor = math.ceil(math.sqrt(depth.size / 3000))
+    offset = (factor - 1) // 2
+    expected = cv2.medianBlur(depth.astype(np.float32), 3)[offset::factor, offset::factor]
+    assert np.array_equal(small, expected)
+
+
 def test_a_large_image_is_reduced_below_the_limit_and_shows_no_new_depths() -> None:
     scene = sample()
     large = np.kron(scene.depth_m[0], np.ones((3, 3), np.float32))

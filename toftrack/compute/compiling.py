@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import gc
 import hashlib
 import inspect
 import logging
@@ -24,6 +23,8 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+
+from toftrack.compute.collector import collector_paused
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +63,7 @@ class Kernel:
     def __call__(self, *args: Any) -> Any:
         if self.is_compiled:
             return self._run(args)
-        with lock, _collector_paused():
+        with lock, collector_paused():
             self.dispatcher = self.dispatcher or _cached(self.function)
             _announce(self.dispatcher)
             with _only_one_process(self.dispatcher.stats.cache_path):
@@ -90,18 +91,6 @@ class Kernel:
 
 entry_point = Kernel
 """Decorator of the functions that Python calls."""
-
-
-@contextlib.contextmanager
-def _collector_paused() -> Iterator[None]:
-    """Without the garbage collector, which takes a sixth of the time that numba compiles."""
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()
 
 
 @contextlib.contextmanager

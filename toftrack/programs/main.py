@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import gc
 import importlib
 import sys
@@ -94,6 +95,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         say(long_help(name), sys.stdout)
         return 0
     gc.set_threshold(20_000)  # loading and compiling leave little to collect
+    atexit.register(gc.freeze)  # nor need the process's end look through all that is loaded
     from toftrack.programs.command_line import run
 
     return run(lambda: _program(name)(rest))
