@@ -9,7 +9,7 @@ but it believes a wrong pose whose crop it sees.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -90,10 +90,11 @@ def compare_sides(view: View, mirrored: Detection, image: DepthImage, arm: Arm) 
     evidence, side = view.track.evidence, view.track.side
     if view.detection.empty or view.detection.present < _LEAST_PRESENT:
         return evidence
+    turned_lead = _start_turned_looks(mirrored, side, image, view.model)
     gain = _best_of_side(view, view.detection, side)
     gain -= _best_of_side(view, mirrored, OTHER_SIDE[side])
     lead = _network_log_odds(view.detection) - _network_log_odds(mirrored)
-    lead = 0.5 * (lead + _turned_lead(mirrored, side, image, view.model))
+    lead = 0.5 * (lead + turned_lead())
     comparisons, body = evidence.comparisons + 1, evidence.body
     body += (body_log_odds(image, arm) - body) / min(comparisons, _BODY_COMPARISONS)
     gain += _NETWORK * lead
@@ -118,16 +119,15 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     return max(best_start(seen)[1], WORST)
 
 
-def _turned_lead(mirrored: Detection, side: str, image: DepthImage, model: TrackerModel) -> float:
-    """Log odds by which the network is surer of `side` in the crops of the other side's pose: a
-    crop that is turned as a pose has it makes that pose's side likelier.
+def _start_turned_looks(
+    mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
+) -> Callable[[], float]:
+    """A function that waits for the log odds by which the network is surer of `side` in crops of
+    the other side's pose: a crop that is turned as a pose has it makes that pose's side likelier.
     """
-    centre, up = mirrored.centre_m.numpy()[None], mirrored.up[None]
-    own, other = (
-        model.detector.detect(image.depth_m, image.k, centre, one, up)[0]
-        for one in (side, OTHER_SIDE[side])
-    )
-    return _network_log_odds(own) - _network_log_odds(other)
+    at = image.depth_m, image.k, mirrored.centre_m.numpy()
+    own, other = (model.detector.start(*at, one, mirrored.up) for one in (side, OTHER_SIDE[side]))
+    return lambda: _network_log_odds(own()) - _network_log_odds(other())
 
 
 def _network_log_odds(detection: Detection) -> float:

@@ -81,10 +81,10 @@ def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerSta
     view = make_view(scene, -1, track, detection, expected_of(detection))
     if view is None:
         return None
-    at = detection.centre_m.numpy()[None], OTHER_SIDE[one.side], detection.up[None]
-    mirrored = model.detector.detect(image.depth_m, image.k, *at)[0]
+    at = detection.centre_m.numpy(), OTHER_SIDE[one.side], detection.up
+    mirrored = model.detector.start(image.depth_m, image.k, *at)
     view = with_parts(replace(view, track=restart_track(view)))
-    return choose_side(scene, -1, view, mirrored, state.told)
+    return choose_side(scene, -1, view, mirrored(), state.told)
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
