@@ -7,7 +7,7 @@ ellipsoid {c + F u : |u| <= 1} with W = F^-1, s = W c and g = s's - 1, the two c
     u = l.p +- sqrt(p' Q p),   l = W's / g,   Q = W'(s s' / g^2 - I / g) W
 
 so the nearest surface is the largest u, a miss is p'Qp < 0, and p'Qp = 0 is the paper's projected
-conic, whose dual is F F' - c c'.
+conic.
 """
 
 from __future__ import annotations
@@ -27,13 +27,12 @@ behind the camera the closed form has no meaning."""
 class Conics(NamedTuple):
     """Closed-form coefficients of N x E ellipsoids in normalised image coordinates.
 
-    linear: (N, E, 3), l.  quadratic: (N, E, 3, 3), Q.  dual: (N, E, 3, 3), F F' - c c'.
+    linear: (N, E, 3), l.  quadratic: (N, E, 3, 3), Q.
     visible: (N, E) bool, false where the ellipsoid reaches the camera.
     """
 
     linear: Tensor
     quadratic: Tensor
-    dual: Tensor
     visible: Tensor
 
 
@@ -44,14 +43,13 @@ def project(ellipsoids: Ellipsoids) -> Conics:
     whiten = axes.mT / axes.square().sum(-2)[..., None]
     s = (whiten @ centres[..., None]).squeeze(-1)
     g = s.square().sum(-1) - 1.0
-    dual = axes @ axes.mT - centres[..., None] * centres[..., None, :]
     nearest = centres[..., 2] - axes[..., 2, :].norm(dim=-1)
     visible = nearest > _NEAREST_M
     g = torch.where(visible, g, 1.0)
     ws = (whiten.mT @ s[..., None]).squeeze(-1)
     linear = ws / g[..., None]
     quadratic = linear[..., None] * linear[..., None, :] - (whiten.mT @ whiten) / g[..., None, None]
-    return Conics(linear, quadratic, dual, visible)
+    return Conics(linear, quadratic, visible)
 
 
 def inverse_depth(conics: Conics, rays: Tensor) -> Tensor:
