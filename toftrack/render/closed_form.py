@@ -22,6 +22,8 @@ from toftrack.hand.surface import Ellipsoids
 _NEAREST_M = 0.02
 """Ellipsoids that come nearer to the camera's centre plane than this are not drawn: inside or
 behind the camera the closed form has no meaning."""
+_CHUNK_BYTES = 64 << 20
+"""Bound on the largest intermediate tensor: hands are rendered in chunks."""
 
 
 class Conics(NamedTuple):
@@ -82,19 +84,16 @@ def pixel_rays(k: Tensor, height: int, width: int) -> Tensor:
     return torch.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)), -1)
 
 
-def render_range_images(
-    ellipsoids: Ellipsoids, k: Tensor, height: int, width: int, chunk_bytes: int = 64 << 20
-) -> Tensor:
+def render_range_images(ellipsoids: Ellipsoids, k: Tensor, height: int, width: int) -> Tensor:
     """Range images of N hands: Z along the optical axis in metres, 0 where there is no surface.
 
     ellipsoids: N x E (leave the wrist's out).  k: (3, 3) intrinsics, same dtype and device.
-    chunk_bytes: bound on the largest intermediate tensor; particles are rendered in chunks.
     Returns (N, H, W).
     """
     conics = project(ellipsoids)
     rays = pixel_rays(k, height, width)
     n, e = conics.visible.shape
-    step = max(1, int(chunk_bytes // max(1, e * height * width * rays.element_size())))
+    step = max(1, _CHUNK_BYTES // max(1, e * height * width * rays.element_size()))
     images = [
         inverse_depth(Conics(*(t[i : i + step] for t in conics)), rays) for i in range(0, n, step)
     ]

@@ -163,12 +163,9 @@ class FilterModel:
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
         return lru_cache(32)(partial(_fitted_hand, self.configured.shape, self.backend))
 
-    def evidence(self, observation: Observation) -> Evidence:
-        """Of an observation, on the particles' device; that of the last few is cached."""
-        return self._evidence(observation)
-
     @cached_property
-    def _evidence(self) -> Callable[[Observation], Evidence]:
+    def evidence(self) -> Callable[[Observation], Evidence]:
+        """Of an observation, on the particles' device; that of the last few is cached."""
         return lru_cache(4)(lambda seen: self.likelihood.evidence(seen).to(self.device))
 
     def decode(self, particles: Tensor) -> Tensor:
