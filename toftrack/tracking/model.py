@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -116,9 +116,10 @@ class FilterModel:
         generator = torch.Generator().manual_seed(seed)
         return TrackerState(generator.get_state(), slots, told)
 
-    def at_quality(self, quality: Quality) -> Self:
+    @cached_property
+    def at_quality(self) -> Callable[[Quality], FilterModel]:
         """The same tracker with less effort; itself where nothing is left out."""
-        return self
+        return lambda _: self
 
     @property
     def fits(self) -> bool:
@@ -195,12 +196,9 @@ class TrackerModel(FilterModel):
     posterior: PosteriorWeights
     lost: ConfidenceModel
 
-    def at_quality(self, quality: Quality) -> TrackerModel:
-        """See FilterModel."""
-        return self._at_quality(quality)
-
     @cached_property
-    def _at_quality(self) -> Callable[[Quality], TrackerModel]:
+    def at_quality(self) -> Callable[[Quality], TrackerModel]:
+        """See FilterModel; each is made once."""
         return lru_cache(partial(_at_quality, self))
 
 
