@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from helpers.detection import FixedDetector
 from helpers.tracking import configuration, make_tracker, sample
 
 from toftrack.api import build_hands_tracker
@@ -152,20 +150,6 @@ def test_a_slow_machine_still_tracks_with_less_quality(hands: int) -> None:
     assert usual.time.pace.reduced and usual.time.reduced > 0
     error_mm = 1e3 * np.linalg.norm(first.joints_m - scene.joints_m[11], axis=1).mean()
     assert not first.lost and error_mm < 20
-
-
-@pytest.mark.parametrize(("search", "searches"), [(1, 12), (3, 4)])
-def test_the_search_is_bounded(search: int, searches: int) -> None:
-    """In an empty room the whole image is searched each so many frames."""
-
-    usual = make_tracker("filter.particles=20", "hand.side=right")
-    detector = FixedDetector(search=search)
-    tracker = Tracker(replace(usual.model, detector=detector))
-    image = np.full((72, 88), 0.9, np.float32)
-    k = np.array([[100.0, 0, 44], [0, 100.0, 36], [0, 0, 1]])
-    for i in range(12):
-        assert tracker.step(image, k, i, i / 25).lost
-    assert len(detector.images) == searches
 
 
 def test_preparing_changes_nothing() -> None:

@@ -99,25 +99,22 @@ def check_agreement(
     seen: SeenPoints,
     settings: Refinement = SETTINGS,
     marks: Keypoints | None = None,
-    atol_m: float = 0.002,
 ) -> Tensor:
-    """A point that is as near to two bones goes to either, and the steps part by a little."""
     found = Refiner(shape)(starts, starts[:, 6:], seen, settings, marks)
     expected = refine(starts, starts[:, 6:], seen, shape, settings, marks)
     assert found.dtype == torch.float32 and found.shape == starts.shape
     joints = [forward_kinematics(states, shape).joints_m for states in (found, expected)]
-    torch.testing.assert_close(*joints, atol=atol_m, rtol=0)
+    torch.testing.assert_close(*joints, atol=1e-5, rtol=0)
     torch.testing.assert_close(Refiner(shape).joints(found), joints[0], atol=1e-5, rtol=0)
     return found
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-@pytest.mark.parametrize("iterations", [1, 5])
-def test_it_agrees_with_the_reference(side: str, iterations: int) -> None:
+def test_it_agrees_with_the_reference(side: str) -> None:
     shape = default_hand_shape(side=side)
     for seed in (1, 2):
         _, seen, starts = seen_hand(shape, seed, n=5)
-        found = check_agreement(shape, starts, seen, refinement(iterations=iterations))
+        found = check_agreement(shape, starts, seen)
         assert ((found - starts).abs().amax(1) > 0.01).all()
 
 
@@ -131,7 +128,7 @@ def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
         starts = torch.zeros(3, 27)
         starts[:, :3] = torch.from_numpy(scene.joints_m[0, 0])
         starts += SPREAD * torch.randn(3, 27, generator=generator(frame))
-        check_agreement(default_hand_shape(side=side), starts, seen, atol_m=0.003)
+        check_agreement(default_hand_shape(side=side), starts, seen)
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -78,13 +78,6 @@ def test_an_image_of_nothing_has_no_points_and_no_silhouette(size: tuple[int, in
     assert len(seen.points_m) == 0 and seen.beside.numel() == 0
 
 
-def test_an_image_of_one_pixel_is_a_point() -> None:
-    hand = torch.ones(1, 1, dtype=torch.bool)
-    seen = seen_points(Observation(torch.full((1, 1), 0.5), hand, ~hand, torch.eye(3), 0.5))
-    assert torch.equal(seen.points_m, torch.tensor([[0.0, 0.0, 0.5]]))
-    assert seen.beside.tolist() == [[0]]
-
-
 def test_an_occluder_is_part_of_the_silhouette_and_has_no_points() -> None:
     observation = observed(0)
     covered = replace(

@@ -10,7 +10,6 @@ import pytest
 import torch
 from helpers.detection import detection_of
 from helpers.tracking import make_tracker, sample
-from reference.refinement import keypoint_residuals
 
 from toftrack.detector.hand_detector import Detection
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
@@ -86,16 +85,6 @@ def test_keypoints_say_by_how_much_a_hand_is_another(side: str) -> None:
     precision = information + torch.diag(torch.tensor([1e-3, 1e-3, 1e3, 1e3, 1e-3, 1e-3]))
     found = torch.linalg.solve(precision, vector)
     torch.testing.assert_close(found[seen], 0.2 * BETWEEN_FINGERS[seen], atol=0.006, rtol=0.1)
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_the_jacobian_is_that_of_the_refinement(side: str) -> None:
-    shape, state = default_hand_shape(side=side), poses(1)
-    pose = forward_kinematics(state, shape)
-    apart = Keypoints(pose.joints_m + 0.001, torch.ones(1, 21))  # so far that all weights are 1
-    rows = keypoint_residuals(pose, apart, shape).rows[0]
-    found = torch.from_numpy(shape_fit._joint_jacobian(pose, shape)).float()
-    torch.testing.assert_close(found, rows, atol=1e-5, rtol=1e-4)
 
 
 def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> None:

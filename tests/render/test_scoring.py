@@ -17,12 +17,12 @@ from toftrack.compute.compiling import entry_point
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.closed_form import pixel_rays, project, render_range_images
+from toftrack.render.closed_form import render_range_images
 from toftrack.render.numba import kernel
 from toftrack.render.numba.vector import WORDS
 from toftrack.render.reference import ReferenceScorer, step_range_images
 from toftrack.render.scoring import Counts, Evidence, dilate_disc, disc_square, disc_steps
-from toftrack.render.torch_scorer import outlines, rendered_depths
+from toftrack.render.torch_scorer import rendered_depths
 from toftrack.tracking.backend import choose_backend, make_scorer
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -306,20 +306,6 @@ def test_depth_in_single_precision():
     assert off.quantile(0.999) < 2e-4
 
 
-def test_silhouette_is_the_dual_conic():
-    """p'C p with C the inverse of the dual conic changes its sign where the rays begin to hit."""
-    k = intrinsics(144, 176, 170.0).double()
-    ellipsoids = _posed(4, 1, torch.float64)
-    rays = pixel_rays(k, 144, 176)
-    conic = project(ellipsoids).dual.inverse()
-    # The centre's own image is inside: its sign says which is the inner one.
-    p = ellipsoids.centres_m / ellipsoids.centres_m[..., 2:]
-    inner = torch.einsum("nei,neij,nej->ne", p, conic, p).sign()
-    value = torch.einsum("hwi,neij,hwj->nehw", rays, conic, rays)
-    hit = (value * inner[..., None, None] >= 0).any(1)
-    assert ((render_range_images(ellipsoids, k, 144, 176) > 0) != hit).sum() <= 2
-
-
 def test_closed_form_is_what_fine_steps_find():
     k = intrinsics(48, 64, 60.0).double()
     ellipsoids = _posed(3, 2, torch.float64)
@@ -333,21 +319,6 @@ def test_closed_form_is_what_fine_steps_find():
     coarse = step_range_images(ellipsoids, k, 48, 64)
     seen = (closed > 0) & (coarse > 0)
     assert (closed - coarse).abs()[seen].median() < 1e-3
-
-
-def test_outlines_are_those_of_the_dual_conics() -> None:
-    k, ellipsoids = intrinsics(144, 176, 170.0).double(), _posed(20, 4, torch.float64)
-    ellipsoids.centres_m[:4, :, 2] *= -1  # behind the camera
-    conics, found = project(ellipsoids), outlines(ellipsoids, k)
-    assert torch.equal(conics.visible, found.high > 0)
-    dual = conics.dual / conics.dual[..., 2:, 2:]
-    for axis, middle, half in ((0, found.x, found.wide), (1, found.y, found.high)):
-        mean = dual[..., axis, 2]
-        spread = (mean.square() - dual[..., axis, axis]).clamp(min=0).sqrt()
-        expected = k[axis, axis] * mean + k[axis, 2], k[axis, axis] * spread
-        seen = conics.visible
-        torch.testing.assert_close(middle[seen], expected[0][seen], atol=1e-3, rtol=1e-5)
-        torch.testing.assert_close(half[seen], expected[1][seen], atol=1e-3, rtol=1e-4)
 
 
 def test_rendered_depths_are_those_of_the_closed_form() -> None:

@@ -57,17 +57,12 @@ def proposed(view: View) -> Hypotheses:
     return propose(view, mean_of(view))
 
 
-def test_each_source_proposes_its_poses_and_all_are_scored_by_the_posterior() -> None:
-    view = viewed(-0.1, 1)
+def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
+    view = viewed(0.0)
     table = proposed(view)
     # The last frame's fingers and the filter's; the detector's, bent to the keypoints.
     assert table.detected.tolist() == [False, False, True]
     torch.testing.assert_close(table.log_posterior, view.log_posterior(table.pose))
-
-
-def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> None:
-    view = viewed(0.0)
-    table = proposed(view)
     before = float(view.log_posterior(view.track.pose))
     assert float(table.log_posterior[0]) > before
     assert float(table.log_posterior.max()) > before + 0.1
@@ -108,27 +103,18 @@ def test_the_best_start_is_the_best_of_all_detected_poses() -> None:
     assert float((joints(pose) - joints(truth)).norm(dim=-1).mean()) < 0.005
 
 
-def keypoint_sigma(detection: Detection, **settings: float) -> torch.Tensor:
-    model = model_with(**settings)
-    return view_of(
-        image_of(hand_at()), track_of(hand_at()), detection, model=model
-    ).keypoints.sigma_m
-
-
-def test_keypoints_are_trusted_no_more_than_is_set() -> None:
-    for sigma_m in (0.005, 0.03):
-        keypoints = replace(detection_of(hand_at()).keypoints, sigma_m=torch.full((21,), sigma_m))
-        detection = replace(detection_of(hand_at()), keypoints=keypoints)
-        assert keypoint_sigma(detection, keypoint_m=0.02) == pytest.approx(max(sigma_m, 0.02))
-
-
-def test_a_keypoint_weight_divides_the_deviations_and_0_leaves_them_without_effect() -> None:
-    plain, half, none = (
-        keypoint_sigma(detection_of(hand_at()), keypoint_weight=weight)
-        for weight in (1.0, 0.5, 0.0)
-    )
-    torch.testing.assert_close(half, 2 * plain)
-    assert bool(none.isfinite().all()) and float(none.min()) > 1000
+@pytest.mark.parametrize(
+    ("sigma_m", "weight", "expected_m"),
+    [(0.005, 1.0, 0.02), (0.03, 1.0, 0.03), (0.03, 0.5, 0.06), (0.03, 0.0, 3e4)],
+)
+def test_keypoints_are_trusted_no_more_than_is_set_and_their_weight_divides_the_deviations(
+    sigma_m: float, weight: float, expected_m: float
+) -> None:
+    detection, track = detection_of(hand_at()), track_of(hand_at())
+    keypoints = replace(detection.keypoints, sigma_m=torch.full((21,), sigma_m))
+    model = model_with(keypoint_m=0.02, keypoint_weight=weight)
+    view = view_of(image_of(), track, replace(detection, keypoints=keypoints), model=model)
+    assert view.keypoints.sigma_m.tolist() == pytest.approx([expected_m] * 21)
 
 
 @pytest.mark.parametrize("count", [0, 1, 8])

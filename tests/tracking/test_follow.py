@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,9 +21,7 @@ from helpers.rendered import (
 from helpers.settings import confidence_model
 
 from toftrack.compute.pace import FRAME_S, Duration, Spans
-from toftrack.detector.hand_detector import Detection
 from toftrack.detector.proposals import SAME_PLACE_M
-from toftrack.render.scoring import Counts
 from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
@@ -120,6 +118,8 @@ def test_the_particles_of_a_hand_that_nobody_asked_for_are_only_moved_on() -> No
     )
     torch.testing.assert_close(other.weights, track.cloud.weights)
     assert 0.0 < float(other.mean[0, 0]) < 0.1 * FRAME_S
+    doubtful = replace(view, track=replace(track, confirmed=False))
+    assert filtered(doubtful, slots=()).particles.std(0).any()
 
 
 @pytest.mark.parametrize(
@@ -139,46 +139,22 @@ def test_a_sure_hand_that_nobody_asked_for_is_looked_at_in_every_third_frame(
     torch.testing.assert_close(moved.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
 
 
-@pytest.mark.parametrize("sure", [True, False])
-def test_while_all_hands_are_sure_those_that_are_not_reported_are_followed_without_the_filter(
-    sure: bool,
+def test_particles_are_filtered_before_a_detection_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    second = track_of(THERE, confirmed=sure)
-    state = state_of(track_of(HERE), second)
-    after, _, (estimate,) = step(state, replace(IMAGE, timestamp_s=FRAME_S), right_hand_model())
-    reported, other = after.tracks
-    assert reported.cloud.particles.std(0).any() and not estimate.lost
-    assert bool(other.cloud.particles.std(0).any()) != sure
-    torch.testing.assert_close(other.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
-
-
-class SlowDetector(FixedDetector):
-    """Waits are noted in `order`."""
-
-    def __init__(self, order: list[str]) -> None:
-        super().__init__()
-        self.order = order
-
-    def start(self, depth_m, k, centre_m, side, up=None) -> Callable[[], Detection]:
-        wait = super().start(depth_m, k, centre_m, side, up)
-        return lambda: (self.order.append("waited"), wait())[1]
-
-
-def test_particles_are_filtered_before_a_detection_is_waited_for() -> None:
     order: list[str] = []
-    model = replace(right_hand_model(), detector=SlowDetector(order))
-    likelihood = type(model.likelihood)
+    model, start = right_hand_model(), FixedDetector.start
+    score = type(model.likelihood).log_score
 
-    class Noted(likelihood):
-        def log_score(self, counts: Counts, coverage: float | None = None) -> torch.Tensor:
-            order.append("scored")
-            return super().log_score(counts, coverage)
+    def noted(name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        return lambda *args: (order.append(name), function(*args))[1]
 
-    noted = Noted(
-        **{field.name: getattr(model.likelihood, field.name) for field in fields(model.likelihood)}
-    )
-    state = state_of(track_of(HERE))
-    step(state, replace(IMAGE, timestamp_s=FRAME_S), replace(model, likelihood=noted))
+    def waits(*args: Any) -> Callable[..., Any]:
+        return noted("waited", start(*args))
+
+    monkeypatch.setattr(FixedDetector, "start", waits)
+    monkeypatch.setattr(type(model.likelihood), "log_score", noted("scored", score))
+    step(state_of(track_of(HERE)), replace(IMAGE, timestamp_s=FRAME_S), model)
     assert order.index("waited") == model.filter.passes
 
 

@@ -94,23 +94,6 @@ def test_the_number_of_threads_changes_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert all(same(one, two) for one, two in zip(*found, strict=True))
 
 
-def test_states_that_are_stepped_in_turn_do_not_disturb_each_other() -> None:
-    right, left = sample(), sample().mirrored()
-    tracker = quick("hand.side=right")
-    alone = [tracked(quick("hand.side=right"), right, range(6))]
-    alone.append(tracked(quick("hand.side=left"), left, range(6)))
-    other = quick("hand.side=left")
-    states = [tracker.state, other.state]
-    together: tuple[list[Estimate], list[Estimate]] = [], []
-    for i in range(6):
-        for number, scene in enumerate((right, left)):
-            tracker.state = states[number]
-            together[number].extend(tracked(tracker, scene, range(i, i + 1)))
-            states[number] = tracker.state
-    for one, two in zip(alone, together, strict=True):
-        assert all(map(same, one, two))
-
-
 def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() -> None:
     tracker, scene = quick(), sample()
     fresh = tracker.state

@@ -58,7 +58,7 @@ class Spans:
     """Wall seconds of stages, from the moment it is made; a second's innermost stage has it."""
 
     def __init__(self) -> None:
-        self._began = self._since = time.perf_counter()
+        self._since = time.perf_counter()
         self._seconds: dict[str, float] = {}
         self._running = [REST]
 
@@ -77,10 +77,6 @@ class Spans:
         """Of each stage until now."""
         self._book()
         return dict(self._seconds)
-
-    def total(self) -> float:
-        """Seconds since it was made."""
-        return time.perf_counter() - self._began
 
     def _book(self) -> None:
         now, stage = time.perf_counter(), self._running[-1]

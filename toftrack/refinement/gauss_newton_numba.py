@@ -374,21 +374,6 @@ def _move(state, prior, settings, sums):
         state[6 + j] = min(max(bent, _LIMITS[j, 0]), _LIMITS[j, 1])
 
 
-@compiled
-def _scratch(ellipsoids, points, seen):
-    """What one thread works in: the hand and its ellipsoids; the matched
-    points, see add_points, and which they are; wrenches, twists and normal equations, see assemble.
-    """
-    hand = empty((16, 3, 3), np.float64), empty((21, 3), np.float64), empty((21, 3), np.float64)
-    posed = empty((ellipsoids, 12), np.float32)
-    distance, nearest = empty(points, np.float32), zeros(points, np.int32)
-    matched = empty((3, points), np.float32), distance, nearest
-    sums = empty((_FREE, _FREE), np.float64), empty(_FREE, np.float64)
-    within = empty(seen + 1, np.int32)
-    wrenches, twists = empty((16, 7, 6), np.float64), empty((_FREE, 6), np.float64)
-    return hand, posed, matched, within, wrenches, twists, sums
-
-
 @entry_point
 def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
     """Refine hands, one after the other: a few are done before a second thread is awake.
@@ -404,11 +389,13 @@ def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
     base_frames, base, lengths, mirror = shape
     index, centres, semi_axes = surface
     iterations, points, _, _, deviation, _, _ = settings
-    hand, posed, matched, within, wrenches, twists, sums = _scratch(
-        len(index), min(points, len(seen[0])), len(seen[0])
-    )
-    frames, joints, axes = hand
-    xyz, distance, nearest = matched
+    most = min(points, len(seen[0]))
+    frames, joints, axes = empty((16, 3, 3)), empty((21, 3)), empty((21, 3))
+    xyz, within = empty((3, most), np.float32), empty(len(seen[0]) + 1, np.int32)
+    distance, nearest = empty(most, np.float32), zeros(most, np.int32)
+    hand, matched = (frames, joints, axes), (xyz, distance, nearest)
+    posed, sums = empty((len(index), 12), np.float32), (empty((_FREE, _FREE)), empty(_FREE))
+    wrenches, twists = empty((16, 7, 6)), empty((_FREE, 6))
     for i in range(len(states)):
         state, row = states[i], i % max(1, len(keypoints[0]))
         known, sigma = keypoints[0][row], keypoints[1][row]

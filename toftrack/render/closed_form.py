@@ -7,7 +7,7 @@ ellipsoid {c + F u : |u| <= 1} with W = F^-1, s = W c and g = s's - 1, the two c
     u = l.p +- sqrt(p' Q p),   l = W's / g,   Q = W'(s s' / g^2 - I / g) W
 
 so the nearest surface is the largest u, a miss is p'Qp < 0, and p'Qp = 0 is the paper's projected
-conic, whose dual is F F' - c c'.
+conic.
 """
 
 from __future__ import annotations
@@ -22,18 +22,19 @@ from toftrack.hand.surface import Ellipsoids
 _NEAREST_M = 0.02
 """Ellipsoids that come nearer to the camera's centre plane than this are not drawn: inside or
 behind the camera the closed form has no meaning."""
+_CHUNK_BYTES = 64 << 20
+"""Bound on the largest intermediate tensor: hands are rendered in chunks."""
 
 
 class Conics(NamedTuple):
     """Closed-form coefficients of N x E ellipsoids in normalised image coordinates.
 
-    linear: (N, E, 3), l.  quadratic: (N, E, 3, 3), Q.  dual: (N, E, 3, 3), F F' - c c'.
+    linear: (N, E, 3), l.  quadratic: (N, E, 3, 3), Q.
     visible: (N, E) bool, false where the ellipsoid reaches the camera.
     """
 
     linear: Tensor
     quadratic: Tensor
-    dual: Tensor
     visible: Tensor
 
 
@@ -44,14 +45,13 @@ def project(ellipsoids: Ellipsoids) -> Conics:
     whiten = axes.mT / axes.square().sum(-2)[..., None]
     s = (whiten @ centres[..., None]).squeeze(-1)
     g = s.square().sum(-1) - 1.0
-    dual = axes @ axes.mT - centres[..., None] * centres[..., None, :]
     nearest = centres[..., 2] - axes[..., 2, :].norm(dim=-1)
     visible = nearest > _NEAREST_M
     g = torch.where(visible, g, 1.0)
     ws = (whiten.mT @ s[..., None]).squeeze(-1)
     linear = ws / g[..., None]
     quadratic = linear[..., None] * linear[..., None, :] - (whiten.mT @ whiten) / g[..., None, None]
-    return Conics(linear, quadratic, dual, visible)
+    return Conics(linear, quadratic, visible)
 
 
 def inverse_depth(conics: Conics, rays: Tensor) -> Tensor:
@@ -84,19 +84,16 @@ def pixel_rays(k: Tensor, height: int, width: int) -> Tensor:
     return torch.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], torch.ones_like(u)), -1)
 
 
-def render_range_images(
-    ellipsoids: Ellipsoids, k: Tensor, height: int, width: int, chunk_bytes: int = 64 << 20
-) -> Tensor:
+def render_range_images(ellipsoids: Ellipsoids, k: Tensor, height: int, width: int) -> Tensor:
     """Range images of N hands: Z along the optical axis in metres, 0 where there is no surface.
 
     ellipsoids: N x E (leave the wrist's out).  k: (3, 3) intrinsics, same dtype and device.
-    chunk_bytes: bound on the largest intermediate tensor; particles are rendered in chunks.
     Returns (N, H, W).
     """
     conics = project(ellipsoids)
     rays = pixel_rays(k, height, width)
     n, e = conics.visible.shape
-    step = max(1, int(chunk_bytes // max(1, e * height * width * rays.element_size())))
+    step = max(1, _CHUNK_BYTES // max(1, e * height * width * rays.element_size()))
     images = [
         inverse_depth(Conics(*(t[i : i + step] for t in conics)), rays) for i in range(0, n, step)
     ]

@@ -38,12 +38,12 @@ class Likelihood:
     def evidence(self, observation: Observation) -> Evidence:
         """The images to compare with, once a frame."""
         seen = observation
-        given = [mask.cpu().numpy() for mask in (seen.hand, seen.occluder)]
+        given = [seen.hand.numpy(), seen.occluder.numpy()]
         for mask in (seen.other, seen.thing):
-            given.append(np.zeros_like(given[0]) if mask is None else mask.cpu().numpy())
+            given.append(np.zeros_like(given[0]) if mask is None else mask.numpy())
         images = np.empty((3, *seen.depth_m.shape), np.float32)
-        _band(seen.depth_m.cpu().numpy(), *given, np.float32(self.tolerance_m), images)
-        lowest, highest, hidden = torch.from_numpy(images).to(seen.depth_m.device)
+        _band(seen.depth_m.numpy(), *given, np.float32(self.tolerance_m), images)
+        lowest, highest, hidden = torch.from_numpy(images)
         distance_m = 1.0 if observation.empty else observation.nearest_m
         radius = self.neighbourhood_m * float(observation.k[0, 0]) / distance_m
         return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)

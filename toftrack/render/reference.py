@@ -16,6 +16,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
 from toftrack.render.closed_form import pixel_rays, render_range_images
+from toftrack.render.model_image import parted
 from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
 
 
@@ -99,11 +100,7 @@ class ReferenceScorer:
 
     def _score(self, states: Tensor, evidence: Evidence) -> Tensor:
         """(4, N) counts of one chunk."""
-        both = self.surface.pose(forward_kinematics(states, self.shape))
-        hand, wrist = (
-            Ellipsoids(both.centres_m[:, part], both.axes_m[:, part])
-            for part in (slice(-1), slice(-1, None))
-        )
+        hand, wrist = parted(self.surface.pose(forward_kinematics(states, self.shape)))
         view = evidence.k.to(states.dtype), *evidence.hand.shape
         depth_m = self.render(hand, *view)
         on_wrist = render_range_images(wrist, *view) > 0

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -23,7 +22,7 @@ _SPECKS = 8
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """What the likelihood sees of one frame.
+    """What the likelihood sees of one frame; on the CPU.
 
     depth_m: (H, W) Z in metres, 0 = no reading; the whole scene.  k: (3, 3) its intrinsics.
     hand: (H, W) bool, the pixels taken for the hand (and the arm it hangs on).
@@ -45,14 +44,6 @@ class Observation:
     def empty(self) -> bool:
         """True when nothing in the frame can be a hand."""
         return not np.isfinite(self.nearest_m)
-
-    def to(self, device: torch.device) -> Observation:
-        """The same observation on another device."""
-        parts = vars(self).items()
-        moved: dict[str, Any] = {
-            name: part.to(device) for name, part in parts if isinstance(part, Tensor)
-        }
-        return replace(self, **moved)
 
 
 @dataclass(frozen=True)
@@ -101,7 +92,7 @@ class NearestSurface:
         expected: Expected | None = None,
         other: np.ndarray | None = None,
     ) -> Observation:
-        """Segment one image; the Observation is on the CPU.
+        """Segment one image.
 
         depth_m: (H, W) float32 Z, 0 = no reading.  k: (3, 3).
         expected: where a tracked hand should be. What is nearer than that, and not the hand itself

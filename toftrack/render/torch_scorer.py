@@ -15,7 +15,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
+from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
 from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
 
@@ -93,10 +93,10 @@ class TorchScorer:
 
     name = "torch"
 
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """shape: on the device of the states to come.  surface: instead of the shape's own."""
+    def __init__(self, shape: HandShape) -> None:
+        """shape: on the device of the states to come."""
         self.shape = shape
-        self.surface = surface or hand_surface(shape)
+        self.surface = hand_surface(shape)
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""

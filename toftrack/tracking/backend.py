@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,7 +12,6 @@ from toftrack.compute import rigid, rigid_numba
 from toftrack.compute.rigid import Motions
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import HandShape
-from toftrack.hand.surface import hand_surface
 from toftrack.render.likelihood import Likelihood, checked_score
 from toftrack.render.numba.scorer import NumbaScorer
 from toftrack.render.numba.scorer import score_rows as score_rows_compiled
@@ -85,7 +83,7 @@ def make_scorer(renderer: str, shape: HandShape, device: torch.device | str = "c
 def _make(name: str, device: torch.device) -> Backend:
     if name == "torch":
         motions = _on_cpu_too(device, rigid.MOTIONS)
-        return Backend(name, device, motions, partial(_torch_scorer, device=device))
+        return Backend(name, device, motions, lambda shape: TorchScorer(shape.to(device)))
     if name == "numba":  # which also scores particles elsewhere; torch moves those
         there = rigid_numba.MOTIONS if device.type == "cpu" else rigid.MOTIONS
         motions = _on_cpu_too(device, there)
@@ -95,11 +93,7 @@ def _make(name: str, device: torch.device) -> Backend:
 
     require_device()
     motions = _on_cpu_too(device, rigid_triton.MOTIONS)
-    return Backend(name, device, motions, partial(TritonScorer, device=device))
-
-
-def _torch_scorer(shape: HandShape, device: torch.device) -> Scorer:
-    return TorchScorer(shape.to(device), hand_surface(shape).to(device))
+    return Backend(name, device, motions, lambda shape: TritonScorer(shape.to(device)))
 
 
 def _on_cpu_too(device: torch.device, there: Motions) -> Motions:

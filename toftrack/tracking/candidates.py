@@ -274,7 +274,7 @@ def without_things(observation: Observation, parts: Parts) -> Observation:
     """
     if observation.empty or np.count_nonzero(parts.kind == THING_PART) < _LEAST_PARTS:
         return observation
-    thing = _classes(observation, observation.hand, parts, _UNKNOWN) == THING_PART
+    thing = _classes(observation, observation.hand, parts) == THING_PART
     if not thing.any():
         return observation
     of_thing = torch.from_numpy(thing)
@@ -289,7 +289,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     """
     occluder = observation.occluder.numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
-    kind = _classes(observation, observation.occluder, detection.parts, _UNKNOWN)
+    kind = _classes(observation, observation.occluder, detection.parts)
     known = np.bincount(surface[kind != _UNKNOWN], minlength=count)
     mine = np.bincount(surface[kind == FOREARM_PART], minlength=count)
     of_arm = (mine > _MOSTLY * known)[surface] & occluder
@@ -299,7 +299,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     return replace(observation, hand=observation.hand | arm, occluder=observation.occluder & ~arm)
 
 
-def _classes(observation: Observation, pixels: Tensor, parts: Parts, other: int) -> np.ndarray:
-    """(H, W) what the pose network calls an image's pixels; `other` where it does not look."""
+def _classes(observation: Observation, pixels: Tensor, parts: Parts) -> np.ndarray:
+    """(H, W) what the pose network calls an image's pixels; _UNKNOWN where it does not look."""
     depth_m, k = observation.depth_m.numpy(), observation.k.numpy()
-    return parts.seen(depth_m, pixels.numpy(), k, other)
+    return parts.seen(depth_m, pixels.numpy(), k, _UNKNOWN)

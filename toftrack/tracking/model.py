@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from typing import ClassVar, Self
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -116,9 +116,10 @@ class FilterModel:
         generator = torch.Generator().manual_seed(seed)
         return TrackerState(generator.get_state(), slots, told)
 
-    def at_quality(self, quality: Quality) -> Self:
+    @cached_property
+    def at_quality(self) -> Callable[[Quality], FilterModel]:
         """The same tracker with less effort; itself where nothing is left out."""
-        return self
+        return lambda _: self
 
     @property
     def fits(self) -> bool:
@@ -163,12 +164,9 @@ class FilterModel:
     def _hands(self) -> Callable[[str, tuple[float, ...]], FittedHand]:
         return lru_cache(32)(partial(_fitted_hand, self.configured.shape, self.backend))
 
-    def evidence(self, observation: Observation) -> Evidence:
-        """Of an observation, on the particles' device; that of the last few is cached."""
-        return self._evidence(observation)
-
     @cached_property
-    def _evidence(self) -> Callable[[Observation], Evidence]:
+    def evidence(self) -> Callable[[Observation], Evidence]:
+        """Of an observation, on the particles' device; that of the last few is cached."""
         return lru_cache(4)(lambda seen: self.likelihood.evidence(seen).to(self.device))
 
     def decode(self, particles: Tensor) -> Tensor:
@@ -198,12 +196,9 @@ class TrackerModel(FilterModel):
     posterior: PosteriorWeights
     lost: ConfidenceModel
 
-    def at_quality(self, quality: Quality) -> TrackerModel:
-        """See FilterModel."""
-        return self._at_quality(quality)
-
     @cached_property
-    def _at_quality(self) -> Callable[[Quality], TrackerModel]:
+    def at_quality(self) -> Callable[[Quality], TrackerModel]:
+        """See FilterModel; each is made once."""
         return lru_cache(partial(_at_quality, self))
 
 

@@ -53,7 +53,6 @@ def classify(
 
     state: (27,) of the hypothesis; where it is NaN there is none, and every image is empty.
     """
-    observation = observation.to(torch.device("cpu"))
     evidence = likelihood.evidence(observation)
     height, width = evidence.hand.shape
     if not np.isfinite(state).all():

@@ -304,7 +304,6 @@ class _Entities:
 
     def _log_observation(self, entity: str, tracked: TrackedHand, observation: Observation) -> None:
         """How each pixel of the tracker's own image counts."""
-        observation = observation.to(torch.device("cpu"))
         hand, occluder = observation.hand.numpy(), observation.occluder.numpy()
         self._log_pinhole(entity, observation.k.numpy(), *hand.shape)
         segments = hand.astype(np.uint8)

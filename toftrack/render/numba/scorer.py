@@ -13,7 +13,7 @@ from torch import Tensor
 from toftrack.compute.threads import run_shared
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
-from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.render.numba.hand import LANES
 from toftrack.render.numba.kernel import pack_evidence, score_hands
 from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
@@ -31,10 +31,9 @@ class NumbaScorer:
 
     name = "numba"
 
-    def __init__(self, shape: HandShape, surface: HandSurface | None = None) -> None:
-        """surface: instead of the shape's own."""
+    def __init__(self, shape: HandShape) -> None:
         shape = shape.to("cpu", torch.float32)
-        surface = (surface or hand_surface(shape)).to("cpu", torch.float32)
+        surface = hand_surface(shape)
         slots = np.full(25, -1, np.int64)
         slots[list(CHAIN_SLOTS)] = np.arange(6, 27)
         covariances = surface.axes_m @ surface.axes_m.mT

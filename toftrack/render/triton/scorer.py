@@ -16,7 +16,7 @@ from torch import Tensor
 from toftrack.compute.transfer import on_device
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
-from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.render.closed_form import _NEAREST_M
 from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
 from toftrack.render.torch_scorer import TorchScorer
@@ -46,23 +46,15 @@ class TritonScorer:
 
     name = "triton"
 
-    def __init__(
-        self,
-        shape: HandShape,
-        surface: HandSurface | None = None,
-        device: torch.device | None = None,
-    ) -> None:
-        """surface: instead of the shape's own.  device: of the states; None = the shape's."""
+    def __init__(self, shape: HandShape) -> None:
+        """shape: on the device of the states to come."""
         require_device()
-        self._device = device or shape.base_m.device
-        self._shape = shape.to("cpu")
-        self._surface = hand_surface(self._shape) if surface is None else surface.to("cpu")
-        tables = _tables(self._shape, self._surface)
-        self._numbers, self._slots = (on_device(part, self._device) for part in tables)
+        self._shape, tables = shape, _tables(shape.to("cpu"))
+        self._numbers, self._slots = (on_device(part, shape.base_m.device) for part in tables)
 
     @functools.cached_property
     def _large(self) -> TorchScorer:
-        return TorchScorer(self._shape.to(self._device), self._surface.to(self._device))
+        return TorchScorer(self._shape)
 
     def __call__(self, states: Tensor, evidence: Evidence) -> Counts:
         """See Scorer; particles whose state is not finite count 0."""
@@ -133,8 +125,9 @@ def _steps(square: int, height: int, width: int, device: torch.device) -> tuple[
     return on_device(steps, device), int(steps[:, 1].max())
 
 
-def _tables(shape: HandShape, surface: HandSurface) -> tuple[Tensor, Tensor]:
+def _tables(shape: HandShape) -> tuple[Tensor, Tensor]:
     """What does not depend on the particle, for each ellipsoid: see project_kernel."""
+    surface = hand_surface(shape)
     count = len(surface.frame_index)
     covariances = surface.axes_m @ surface.axes_m.mT
     rows, columns = torch.triu_indices(3, 3)
