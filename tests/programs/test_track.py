@@ -250,13 +250,6 @@ def test_a_folder_that_is_used_again_lists_what_this_run_wrote(here, tmp_path) -
     assert "earlier run" in (tmp_path / "out" / "track.log").read_text()  # which goes on
 
 
-def test_an_output_folder_that_cannot_be_written_is_one_clear_sentence(here, tmp_path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    status, out, err = here("hydra.run.dir=file/out")
-    assert (status, out) == (1, "")
-    assert err.startswith("error: ") and err.count("\n") == 1 and "hydra.run.dir" in err
-
-
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
     """A folder of images whose third one is damaged."""
     with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:

@@ -66,8 +66,9 @@ def _tracker(seed: int, side: str, fault: Break) -> tuple[Tracker, TrackerState]
     return tracker, tracker.state
 
 
-def tracked(recording: FrameStore, seed: int, side: str, fault: Break) -> Estimates:
-    """What the tracker says of all frames of a recording, with a fault in it."""
+def tracked(recording: FrameStore, seed: int, side: str, name: str | None) -> Estimates:
+    """What the tracker says of all frames of a recording, with a fault of that name in it."""
+    fault = WHOLE if name is None else BREAKS[name]
     side = OTHER_SIDE.get(side, side) if fault.other_side else side
     camera = recording.camera
     k = camera.K * np.array([[fault.k_scale], [fault.k_scale], [1.0]])
@@ -80,26 +81,28 @@ def tracked(recording: FrameStore, seed: int, side: str, fault: Break) -> Estima
     return estimates_of(found)
 
 
-def sample_figures(seed: int, fault: Break) -> dict[str, float]:
+def sample_figures(seed: int, fault: str | None) -> dict[str, float]:
     """Of the sample: its mean joint error, and the share of frames that are lost."""
     sample = open_source("sample")
     assert sample.truth is not None
     found = tracked(sample, seed, "right", fault)
     figures = measured(found, sample.truth).first.trust
     return {
+        "seed": seed,
         "sample_mm": float(figures.mean_all_mm or np.nan),
         "sample_lost_pct": 100.0 * float(found.lost.mean()),
     }
 
 
-def guard_figures(seed: int, fault: Break) -> dict[str, float]:
+def guard_figures(seed: int, fault: str | None) -> dict[str, float]:
     """Of the guards, means over recordings; NaN where nothing could be measured."""
     found = []
     for recording in recordings("guards").values():
         assert recording.truth is not None
         side = str(recording.metadata.get("side", "right"))
         found.append(measured(tracked(recording, seed, side, fault), recording.truth).first)
-    values = {
+    values: dict[str, float | None] = {
+        "seed": seed,
         "usable_pct": mean_of([one.trust.usable_pct for one in found]),
         "silent_pct": mean_of([one.trust.silent_pct for one in found]),
         "jitter_mm": mean_of([one.figures["jitter_mm"] for one in found]),
@@ -110,7 +113,7 @@ def guard_figures(seed: int, fault: Break) -> dict[str, float]:
     return {name: np.nan if value is None else value for name, value in values.items()}
 
 
-def empty_figures(seed: int, fault: Break) -> dict[str, float]:
+def empty_figures(seed: int, fault: str | None) -> dict[str, float]:
     """Of rooms, and persons who raise no hand: frames that are called a hand."""
     found = [tracked(one, seed, "auto", fault) for one in recordings("empty").values()]
     return {"called_hand_pct": 100.0 * float(np.mean([(~one.lost).mean() for one in found]))}
@@ -140,18 +143,6 @@ def _seeds(text: str) -> tuple[int, ...]:
     return tuple(range(int(first), int(last or first) + 1))
 
 
-def _sample_row(seed: int, fault: str | None) -> dict[str, float]:
-    return {"seed": float(seed), **sample_figures(seed, BREAKS.get(str(fault), WHOLE))}
-
-
-def _guard_row(seed: int, fault: str | None) -> dict[str, float]:
-    return {"seed": float(seed), **guard_figures(seed, BREAKS.get(str(fault), WHOLE))}
-
-
-def _empty_row(seed: int, fault: str | None) -> dict[str, float]:
-    return empty_figures(seed, BREAKS.get(str(fault), WHOLE))
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Is the tracker as accurate as it was?")
     parser.add_argument("--seeds", type=_seeds, default=SEEDS, help="0-19: these (0-2)")
@@ -161,9 +152,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seeds, processes = options.seeds, min(os.cpu_count() or 1, 8)
     # Each process tracks with one thread, as one process would: the figures are the same.
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        empty = pool.map(_empty_row, seeds, [options.fault] * len(seeds))
-        guarded = pool.map(_guard_row, seeds, [options.fault] * len(seeds))
-        sampled = pool.map(_sample_row, SEEDS, [options.fault] * len(SEEDS))
+        empty = pool.map(empty_figures, seeds, [options.fault] * len(seeds))
+        guarded = pool.map(guard_figures, seeds, [options.fault] * len(seeds))
+        sampled = pool.map(sample_figures, SEEDS, [options.fault] * len(SEEDS))
         figures = [one | other for one, other in zip(guarded, empty, strict=True)]
         sample = list(sampled)
     for row in (*sample, *figures):
