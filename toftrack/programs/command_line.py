@@ -227,11 +227,12 @@ class FailedJobs(Callback):
 def _given(config: DictConfig, kind: str) -> Path:
     try:
         check_interpolations(config)
-    except ToftrackError as large:
-        raise _JobFailedError(large) from large
-    if not (folder := config.hydra[kind].dir):  # which would be the current one
-        error = ToftrackError(f"hydra.{kind}.dir is empty; give a folder, or . for the current one")
-        raise _JobFailedError(error)
+        if not (folder := config.hydra[kind].dir):  # which would be the current one
+            raise ToftrackError(
+                f"hydra.{kind}.dir is empty; give a folder, or . for the current one"
+            )
+    except ToftrackError as error:
+        raise _JobFailedError(error) from error
     return Path(folder)
 
 
@@ -269,9 +270,8 @@ def _clear(folder: Path, new: tuple[Path, ...]) -> None:
     """Remove a folder that holds nothing but what Hydra put there."""
     files = [path for path in folder.glob("*") if path.name != ".hydra"]
     inner = list(folder.glob(".hydra/*"))
-    if any(path.suffix != ".log" and path.name != _SWEEPS for path in files):
-        return
-    if any(path.name not in _HYDRAS for path in inner):
+    others = [path for path in files if path.suffix != ".log" and path.name != _SWEEPS]
+    if others or any(path.name not in _HYDRAS for path in inner):
         return
     for handler in list(logging.root.handlers):  # Windows removes no file that is open
         if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename) in files:
