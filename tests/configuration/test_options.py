@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import sys
 from pathlib import Path
 
@@ -58,9 +57,7 @@ def given_for(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str],
     images = folder / "images"
     images.mkdir()
     cv2.imwrite(str(images / "0.png"), np.full((30, 40), 600, np.uint16))
-    camera = {"format": "toftrack-camera", "version": 1, "width": 40, "height": 30}
-    k = [[50, 0, 20], [0, 50, 15], [0, 0, 1]]
-    (images / "camera.json").write_text(json.dumps(camera | {"K": k}))
+    Camera(np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]), 40, 30).save(images / "camera.json")
     sample = ROOT / "toftrack" / "data" / "sample.npz"
     return {
         ("device", "replay"): [f"device.path={sample}"],

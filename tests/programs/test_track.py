@@ -15,14 +15,14 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from helpers import programs
 from helpers.programs import QUICK
-from helpers.tracking import ROOT
+from helpers.tracking import ROOT, sample
 from helpers.videos import video_frames
 
+from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import STATES
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -30,6 +30,7 @@ from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.run_folder import read_run
 from toftrack.programs.export import export
 from toftrack.programs.recover import recover
+from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.views.overlay import caption_px
 
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
@@ -109,9 +110,7 @@ def test_the_summary_is_of_the_same_frames_and_holds_the_metrics(whole) -> None:
     summary = json.loads((whole[0] / "summary.json").read_text())
     result = read_results(whole[0] / "track.npz")
     assert summary["frames"] == 12 and summary["lost_frames"] == int(result["lost"].sum())
-    with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
-        truth = sample["joints_m"][5:12]
-    error = 1e3 * np.linalg.norm(result["joints_m"][5:] - truth, axis=-1)
+    error = 1e3 * np.linalg.norm(result["joints_m"][5:] - sample().joints_m[5:12], axis=-1)
     assert summary["metrics"]["mean_mm"] == pytest.approx(error.mean(), rel=1e-4)
     assert summary["metrics"]["mean_mm"] < 15
     assert 0 <= summary["metrics"]["trust"]["usable_pct"] <= 100
@@ -252,18 +251,13 @@ def test_a_folder_that_is_used_again_lists_what_this_run_wrote(here, tmp_path) -
 
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
     """A folder of images whose third one is damaged."""
-    with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
-        depth, k = sample["depth_m"][:4].astype(np.float32), sample["K"]
-    folder = tmp_path / "images"
-    folder.mkdir()
-    for i, image in enumerate(depth):
-        cv2.imwrite(str(folder / f"{i}.png"), np.rint(image * 1000).astype(np.uint16))
-    camera = {"format": "toftrack-camera", "version": 1, "width": 176, "height": 144}
-    (folder / "camera.json").write_text(json.dumps(camera | {"K": k.tolist()}))
-    whole_image = (folder / "2.png").read_bytes()
-    (folder / "2.png").write_bytes(whole_image[:200])
+    with PngFolderWriter(tmp_path / "images", Camera(sample().k, 176, 144)) as writer:
+        for number, image in enumerate(sample().depth_m[:4]):
+            writer.append(image, None, number / 25)
+    third = tmp_path / "images" / "depth_000002.png"
+    third.write_bytes(third.read_bytes()[:200])
     status, _, err = here("device=replay", "device.path=images", "view=none", *QUICK)
     assert status == 1
-    assert err.splitlines()[-1].startswith("error: ") and "2.png" in err.splitlines()[-1]
+    assert err.splitlines()[-1].startswith("error: ") and third.name in err.splitlines()[-1]
     assert len(read_results(tmp_path / "out" / "track.npz")["joints_m"]) == 2
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == 2
