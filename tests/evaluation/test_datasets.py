@@ -22,17 +22,17 @@ from toftrack.evaluation.datasets import (
 FRAMES = 3
 
 
+PARTS = {"MSRA14": "Subject1", "MSRA15": "P0/TIP", "ICVL": "Testing", "NYU": "test"}
+"""Where the only sequence of a data set lies."""
+
+
 def write(name: str, folder: Path, frames: int = FRAMES) -> Scene:
     """A data set of one sequence; what it shows."""
     seen = scene(NYU_CAMERA if name == "NYU" else INTEL_CREATIVE, frames)
-    if name == "MSRA14":
-        write_msra(folder / "Subject1", seen, boxed=False)
-    elif name == "MSRA15":
-        write_msra(folder / "P0" / "TIP", seen, boxed=True)
-    elif name == "ICVL":
-        write_icvl(folder / "Testing", seen)
+    if name.startswith("MSRA"):
+        write_msra(folder / PARTS[name], seen, boxed=name == "MSRA15")
     else:
-        write_nyu(folder / "test", seen)
+        {"ICVL": write_icvl, "NYU": write_nyu}[name](folder / PARTS[name], seen)
     return seen
 
 
@@ -85,10 +85,9 @@ def test_labels_lie_on_the_hand(name: str, tmp_path: Path) -> None:
 
 
 def test_the_folder_of_a_part_or_sequence_will_do(tmp_path: Path) -> None:
-    for name, part in (("MSRA15", "P0/TIP"), ("ICVL", "Testing"), ("NYU", "test")):
-        folder = tmp_path / name
-        write(name, folder)
-        assert len(open_data_set(name, folder / part)[1]) == 1
+    for name, part in PARTS.items():
+        write(name, tmp_path / name)
+        assert len(open_data_set(name, tmp_path / name / part)[1]) == 1
 
 
 def test_sequences_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:

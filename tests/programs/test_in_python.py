@@ -63,11 +63,8 @@ def test_the_estimates_and_results_are_those_of_the_command_line(
         values = [np.asarray(getattr(one, name), of_run[name].dtype) for one in estimates]
         assert np.array_equal(getattr(results, name), of_run[name], equal_nan=name == "covariance")
         assert np.array_equal(np.array(values).reshape(of_run[name].shape), of_run[name])
-    again = results.estimates(-1)[1]
-    assert (again.side, again.confidence) == (
-        estimates[-1].side,
-        np.float32(estimates[-1].confidence),
-    )
+    again, last = results.estimates(-1)[1], estimates[-1]
+    assert (again.side, again.confidence) == (last.side, np.float32(last.confidence))
     assert str(results) == "<Results: 3 frames, 2 slots, 0% lost>" and "joints_m" in dir(results)
     with pytest.raises(AttributeError, match="no array 'joint_m'; it has index, .*joints_m"):
         _ = results.joint_m
@@ -87,10 +84,7 @@ def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_pa
     with (tmp_path / "hand.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["index"], row["slot"]) for row in rows][-2:] == [("2", "0"), ("2", "1")]
-    for name, words in (
-        ("hand.txt", "end in .npz, .jsonl or .csv"),
-        ("a/b.csv", "cannot be written"),
-    ):
+    for name, words in (("hand.txt", "in .npz, .jsonl or .csv"), ("a/b.csv", "cannot be written")):
         with pytest.raises(toftrack.ToftrackError, match=words):
             results.save(tmp_path / name)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from helpers.tracking import run
 
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
+from toftrack.files.json_text import read_json
 from toftrack.frames.frame import Frame
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -34,22 +34,15 @@ class Late(BaseDevice):
                 yield frame
 
 
-def summary_of(folder: Path) -> dict:
-    return json.loads((folder / "summary.json").read_text())
-
-
 def test_a_run_that_was_too_slow_says_so(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     run(tmp_path, Late(every=5, live=True), *OVERRIDES)
     out, err = capsys.readouterr()
-    reported = summary_of(tmp_path)
+    reported = read_json(tmp_path / "summary.json")
     assert reported["realtime"]["dropped_frames"] == reported["dropped_frames"] == 12
     assert reported["realtime"]["tracked_frames"] == FEW
     assert reported["realtime"]["longest_gap_s"] == pytest.approx(0.2)
-    notes = [line for line in err.splitlines() if line.startswith("note: ")]
-    assert len(notes) == 1
-    assert notes[0].startswith(
-        "note: 12 of 16 frames were dropped: the machine was too slow for 25"
-    )
+    (note,) = (line for line in err.splitlines() if line.startswith("note: "))
+    assert "12 of 16 frames were dropped: the machine was too slow for 25" in note
     assert "16, 0 of them lost, 12 dropped" in out
 
 
@@ -57,5 +50,5 @@ def test_of_a_recording_nothing_of_that_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     run(tmp_path, Late(every=5, live=False), *OVERRIDES, "tracker.budget_ms=0.001")
-    assert "realtime" not in summary_of(tmp_path)
+    assert "realtime" not in read_json(tmp_path / "summary.json")
     assert "too slow" not in capsys.readouterr().err
