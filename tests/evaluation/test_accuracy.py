@@ -123,7 +123,6 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
     cases = [
         ([str(empty)], "has no recording with truth"),
         ([str(tmp_path / "mine.npz")], "mine.npz' has no truth (an .npz with 'joints_m')"),
-        ([str(tmp_path / "mine.npz")], "--labels FILE, which `toftrack label RECORDING` makes"),
         ([str(tmp_path / "text.npz")], "text.npz"),
         ([str(folder), str(folder)], "two recordings are called 'short/a'"),
         ([str(folder), "--compare", str(tmp_path / "old.json")], "has no 'rows'"),

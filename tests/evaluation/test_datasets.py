@@ -229,7 +229,3 @@ def test_what_a_folder_lacks_is_reported(name: str, tmp_path: Path) -> None:
     write(name, tmp_path, 1)
     file_of(tmp_path, *IMAGES).unlink()
     assert "there is no image" in refusal(name, tmp_path)
-
-
-def test_an_unknown_data_set_is_reported_with_the_known_ones(tmp_path: Path) -> None:
-    assert "MSRA14, MSRA15, ICVL, NYU" in refusal("MSRA", tmp_path)

@@ -36,19 +36,6 @@ from toftrack.views.overlay import caption_px
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
 
 
-def start(*arguments: str, cwd: Path) -> subprocess.Popen[str]:
-    """`python track.py` in a process of its own, started in another folder."""
-    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
-    return subprocess.Popen(
-        [sys.executable, str(ROOT / "track.py"), *arguments],
-        cwd=cwd,
-        env=clean | {"OMP_NUM_THREADS": "1"},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 @pytest.fixture
 def here(tmp_path: Path) -> Callable[..., tuple[int, str, str]]:
     """`python track.py` within this process, with `out` for its folder."""
@@ -130,7 +117,10 @@ def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
-    process = start("hydra.run.dir=out", *QUICK, cwd=tmp_path)
+    command = [sys.executable, str(ROOT / "track.py"), "hydra.run.dir=out", *QUICK]
+    env = os.environ | {"HYDRA_FULL_ERROR": "0", "OMP_NUM_THREADS": "1"}
+    said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    process = subprocess.Popen(command, cwd=tmp_path, env=env, text=True, **said)
     lines, deadline = tmp_path / "out" / "track.jsonl", time.monotonic() + 200
     while time.monotonic() < deadline:
         if lines.exists() and lines.read_text().count("\n") >= 3:
