@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,8 +99,7 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
 
 def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
     """None where there is neither truth nor labels."""
-    recording = read_recording(file)
-    try:
+    with closing(read_recording(file)) as recording:
         name = f"{file.absolute().parent.name}/{file.stem}"
         count, size = len(recording), (recording.camera.width, recording.camera.height)
         if recording.truth is not None:
@@ -116,8 +116,6 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
                 f"'{file}'; give one of them at a time"
             )
         return Source(file, name, count, fitting[0]) if fitting else None
-    finally:
-        recording.close()
 
 
 def jobs(
