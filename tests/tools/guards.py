@@ -55,7 +55,6 @@ BOUNDS = {
 leave them, and there is a margin for the floats of other processors: docs/lab/guards.md."""
 
 
-INDEX = 1
 OTHER_SIDE = {"left": "right", "right": "left"}
 
 
@@ -65,7 +64,6 @@ class Break:
     for what no setting can do.  k_scale: times the camera's matrix.  other_side: a wrong one given.
     """
 
-    about: str
     overrides: tuple[str, ...] = ()
     patched: Callable[[], AbstractContextManager[object]] = nullcontext
     k_scale: float = 1.0
@@ -76,8 +74,8 @@ class Break:
 def _turned_index(degrees: float) -> Iterator[None]:
     """The index finger bends about another axis, turned about the finger's own direction."""
     rows = list(shape._REST_DEGREES)
-    abduction, elevation, roll = rows[INDEX]
-    rows[INDEX] = (abduction, elevation, roll + degrees)
+    abduction, elevation, roll = rows[1]
+    rows[1] = (abduction, elevation, roll + degrees)
     with patch.object(shape, "_REST_DEGREES", tuple(rows)):
         yield
 
@@ -93,20 +91,15 @@ def _doubled(
 
 
 BREAKS = {
-    "keypoints off": Break(
-        "the networks' keypoints neither judge nor pull a pose",
-        ("posterior.keypoints=0", "detector.keypoint_weight=0"),
-    ),
-    "finger's axis": Break(
-        "the index finger bends about an axis turned by 5 degrees",
-        patched=lambda: _turned_index(5.0),
-    ),
+    # The networks' keypoints neither judge nor pull a pose.
+    "keypoints off": Break(("posterior.keypoints=0", "detector.keypoint_weight=0")),
+    "finger's axis": Break(patched=lambda: _turned_index(5.0)),
+    # All joints' standard deviations twice as large.
     "sigma doubled": Break(
-        "all joints' standard deviations twice as large",
-        patched=lambda: patch.object(confidence.JointConfidence, "judge", _doubled),
+        patched=lambda: patch.object(confidence.JointConfidence, "judge", _doubled)
     ),
-    "other side": Break("the other hand's side is given", other_side=True),
-    "K scaled": Break("the camera's matrix times 1.1", k_scale=1.1),
+    "other side": Break(other_side=True),
+    "K scaled": Break(k_scale=1.1),
 }
 
 
@@ -124,7 +117,7 @@ def _tracker(seed: int, side: str, fault: Break) -> tuple[Tracker, TrackerState]
 
 def tracked(recording: FrameStore, seed: int, side: str, name: str | None) -> Estimates:
     """What the tracker says of all frames of a recording, with a fault of that name in it."""
-    fault = Break("nothing is broken") if name is None else BREAKS[name]
+    fault = Break() if name is None else BREAKS[name]
     side = OTHER_SIDE.get(side, side) if fault.other_side else side
     camera = recording.camera
     k = camera.K * np.array([[fault.k_scale], [fault.k_scale], [1.0]])
