@@ -69,7 +69,7 @@ def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:
     # Speed is not for a test to judge, but this is off by orders of magnitude only if broken.
     medians = {key: row["median_ms"] for key, row in rows.items()}
     assert medians["scoring", "naive", 8] > 10 * medians["scoring", "numba", 8]
-    assert {key[1] for key in rows if key[0] == "decoding"} == set(speed.SPACES)
+    assert {key[1] for key in rows if key[0] == "decoding"} == set(speed.KINDS)
     parts = {row["method"]: row["parts"] for row in result["rows"] if row["parts"]}
     kinds = ("", ", start", ", searching")
     assert set(parts) == {f"{name}{kind}" for name in ("default", "paper") for kind in kinds}
