@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 import sys
 from pathlib import Path
 
@@ -16,7 +15,7 @@ import yaml
 from helpers import fake_orbbec
 from helpers.bags import recording, write_bag
 from helpers.tracking import CONF, ROOT, configuration
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from toftrack.api import build_tracker
 from toftrack.errors import ToftrackError
@@ -25,16 +24,14 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_NAMES, forward_kinematics
 from toftrack.pose_space.data.pose_data import synthetic_data
 
-OPTIONS = sorted(
-    (path.parent.name, path.stem) for path in CONF.glob("*/*.yaml") if path.parent != CONF
-)
-OF_TRAINING = ("data",)
-"""Groups of train_pose_space.py; the others are track.py's."""
-
+OPTIONS = sorted((path.parent.name, path.stem) for path in CONF.glob("*/*.yaml"))
 OF_EXTRAS = {
-    ("stream", "osc"): ("pythonosc", "osc"),
+    "osc": ("pythonosc", "pip install '.[osc]'"),
+    "realsense": ("pyrealsense2", "pyrealsense2 is not installed"),
+    "rerun": ("rerun", "of the extra rerun"),
+    "triton": ("triton", "triton is not installed"),
 }
-"""The package and the extra that an option needs."""
+"""The package that an option needs, and why it is not made without."""
 # Without it the kernels' widths are cross-validated, which takes seconds.
 FASTER = {
     "isomap": ["pose_space.neighbours=8"],
@@ -60,9 +57,7 @@ def given_for(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str],
     images = folder / "images"
     images.mkdir()
     cv2.imwrite(str(images / "0.png"), np.full((30, 40), 600, np.uint16))
-    camera = {"format": "toftrack-camera", "version": 1, "width": 40, "height": 30}
-    k = [[50, 0, 20], [0, 50, 15], [0, 0, 1]]
-    (images / "camera.json").write_text(json.dumps(camera | {"K": k}))
+    Camera(np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]), 40, 30).save(images / "camera.json")
     sample = ROOT / "toftrack" / "data" / "sample.npz"
     return {
         ("device", "replay"): [f"device.path={sample}"],
@@ -76,27 +71,15 @@ def given_for(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str],
     }
 
 
-def composed(group: str, option: str, *overrides: str) -> DictConfig:
-    name = "train_pose_space" if group in OF_TRAINING else "config"
-    paper = ["experiment=paper"] if group == "start" else []
-    return configuration(*paper, f"{group}={option}", *overrides, name=name)
-
-
 @pytest.mark.parametrize(("group", "option"), OPTIONS)
 def test_every_option_composes_and_can_be_made(
     group: str, option: str, given_for: dict, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    if option == "rerun":
-        pytest.importorskip("rerun", reason="of the extra rerun")
-    if (group, option) in OF_EXTRAS:
-        package, extra = OF_EXTRAS[group, option]
-        pytest.importorskip(package, reason=f"pip install '.[{extra}]'")
-    if option == "triton":
-        pytest.importorskip("triton", reason="triton is not installed")
-        if not torch.cuda.is_available():
-            pytest.skip("there is no CUDA device")
-    if option == "realsense":
-        pytest.importorskip("pyrealsense2", reason="pyrealsense2 is not installed")
+    if option in OF_EXTRAS:
+        package, reason = OF_EXTRAS[option]
+        pytest.importorskip(package, reason=reason)
+    if option == "triton" and not torch.cuda.is_available():
+        pytest.skip("there is no CUDA device")
     femto = fake_orbbec.Camera("1", {fake_orbbec.DEPTH: [fake_orbbec.profile("y16")]})
     monkeypatch.setitem(sys.modules, "pyorbbecsdk", fake_orbbec.Sdk(femto))
     given = given_for.get((group, option), []) + FASTER.get(option, [])
@@ -104,7 +87,9 @@ def test_every_option_composes_and_can_be_made(
         frames = [np.ones((6, 8), np.float32)]
         bag = write_bag(tmp_path, "bag", recording(frames, Camera(np.diag((9.0, 9, 1)), 8, 6)))
         given = [f"device.path={bag}"]
-    config = composed(group, option, *given)
+    paper = ["experiment=paper"] if group == "start" else []
+    name = "train_pose_space" if group == "data" else "config"
+    config = configuration(*paper, f"{group}={option}", *given, name=name)
     part = config if group == "experiment" else config[group]
     missing = OmegaConf.missing_keys(part)
     assert not missing, f"{group}={option} asks for {missing}: give this test values for them"

@@ -13,7 +13,8 @@ from toftrack.evaluation.measures import FLAG_COUNTS
 
 K = np.array([[100.0, 0, 50], [0, 100, 40], [0, 0, 1]])
 ALL_OK = np.ones((3, 21), bool)
-_FRAME = {"points": {"wrist": [0, 0, "visible"]}}
+SIZED = {"image_size": [1, 2], "side": "left"}
+STILL = SIZED | {"images": [3], "called": {"3": []}, "shown_frames": 1}
 
 
 def labels(tmp_path, content) -> Points | Stills:
@@ -63,24 +64,14 @@ def test_labels_beyond_the_recordings_end_are_refused(tmp_path) -> None:
 
 
 def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> None:
-    content = {
-        "image_size": [32, 24],
-        "side": "right",
-        "shown_frames": 10,
-        "images": [1, 6],
-        "called": {"1": ["palm"], "6": ["other", ""]},
-    }
-    found = labels(tmp_path, content)
+    called = {"1": ["palm"], "6": ["other", ""]}
+    found = labels(tmp_path, STILL | {"images": [1, 6], "called": called})
     assert isinstance(found, Stills) and found.images == ("1", "6")
     palm, horns = (found.called[image] for image in found.images)
     assert still_row("palm", False, palm)["named_pct"] == 100
-    assert still_row("other", False, palm) == {
-        "found_pct": 100,
-        "named_pct": 0,
-        "wrong_name_pct": 0,
-    }
+    assert list(still_row("other", False, palm).values()) == [100, 0, 0]
     assert still_row("fist", False, palm)["wrong_name_pct"] == 100
-    assert still_row("", True, horns) == {"found_pct": 0, "named_pct": 0, "wrong_name_pct": 0}
+    assert set(still_row("", True, horns).values()) == {0}
     assert still_row("other", False, horns)["named_pct"] == 100
     assert still_row("three", False, horns)["wrong_name_pct"] == 100
 
@@ -90,23 +81,13 @@ def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> N
     [
         [],
         {},
-        {"image_size": [1, 2], "side": "up", "frames": {}},
-        {"image_size": [1, 2], "side": "left", "frames": {"0": {"points": {"nose": [1, 2, "x"]}}}},
-        {"image_size": [1, 2], "side": "left", "images": [3], "called": {}, "shown_frames": 1},
-        {
-            "image_size": [1, 2],
-            "side": "left",
-            "images": [3],
-            "called": {"3": []},
-            "shown_frames": 1e9,
-        },
-        {"image_size": [float("inf"), 2], "side": "left", "frames": {}},
-        {"image_size": [1, 2], "side": "left", "frames": {"05": _FRAME}},
-        {
-            "image_size": [1, 2],
-            "side": "left",
-            "frames": {"5": {"points": {"wrist": [0, float("nan"), "guessed"]}}},
-        },
+        SIZED | {"side": "up", "frames": {}},
+        SIZED | {"frames": {"0": {"points": {"nose": [1, 2, "x"]}}}},
+        STILL | {"called": {}},
+        STILL | {"shown_frames": 1e9},
+        SIZED | {"image_size": [float("inf"), 2], "frames": {}},
+        SIZED | {"frames": {"05": {"points": {"wrist": [0, 0, "visible"]}}}},
+        SIZED | {"frames": {"5": {"points": {"wrist": [0, float("nan"), "guessed"]}}}},
     ],
 )
 def test_labels_of_neither_kind_are_reported_in_one_sentence(tmp_path, content) -> None:

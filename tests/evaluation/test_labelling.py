@@ -174,8 +174,3 @@ def test_without_a_hand_the_whole_image_is_shown(tmp_path) -> None:
         assert frame.centre_px == (87.5, 71.5) and frame.reach_px == 88
         # A frame in which nobody finds a hand comes last.
         assert track(device, config).confidence.tolist() == [1, 1]
-
-
-def test_a_part_of_a_recording_is_refused() -> None:
-    with pytest.raises(ToftrackError, match="leave out device.start"):
-        label_frames(Sample(start=3, stop=6), configuration(), [1])

@@ -22,20 +22,12 @@ def times(name: str, *rounds: float) -> Times:
     return Times(name, [[ms] * 8 + [0.5 * ms, 3 * ms] for ms in rounds])
 
 
-def test_rounds_are_compared_one_by_one() -> None:
-    ours, other = times(FIRST, 5.0, 20.0, 8.0), times("other", 10.0, 20.0, 16.0)
-    assert ours.medians == [5.0, 20.0, 8.0]
-    assert ours.over(other) == [0.5, 1.0, 0.5]
-    assert all(1 < tail < 3 for tail in ours.tails)
-
-
 def test_the_table_has_the_ratios_and_the_starts() -> None:
-    peer_name = next(iter(PEER_HANDS))
     found = [
         times(FIRST, 5.0, 6.0),
         times("a, one hand", 10.0, 10.0),
         times("a, both", 15.0, 16.0),
-        times(peer_name, 20.0, 20.0),
+        times(next(iter(PEER_HANDS)), 20.0, 20.0),
     ]
     names = ("kernels", "first_s", "wall_s", "user_s", "system_s")
     begun = [
@@ -43,7 +35,8 @@ def test_the_table_has_the_ratios_and_the_starts() -> None:
         for values in ((False, 12.0, 14.0, 20.0, 1.7), (True, 3.0, 3.9, 4.0, 0.5))
     ]
     said = show(found, begun).splitlines()
-    assert said[1].startswith(FIRST) and "0.28 (0.25, 0.30)" in said[1]
+    figures = ("5.5 (5.0, 6.0)", "1.20 (1.20, 1.20)", "0.28 (0.25, 0.30)")  # round by round
+    assert said[1].startswith(FIRST) and all(one in said[1] for one in figures)
     assert said[5].startswith("a, both over one hand: median 1.55 (1.50, 1.60)")
     assert said[6].startswith("three frames without kernels") and "14.0" in said[6]
     assert said[7].startswith("three frames with kernels") and "3.9" in said[7]
@@ -76,7 +69,7 @@ def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:
     # Speed is not for a test to judge, but this is off by orders of magnitude only if broken.
     medians = {key: row["median_ms"] for key, row in rows.items()}
     assert medians["scoring", "naive", 8] > 10 * medians["scoring", "numba", 8]
-    assert {key[1] for key in rows if key[0] == "decoding"} == set(speed.SPACES)
+    assert {key[1] for key in rows if key[0] == "decoding"} == set(speed.KINDS)
     parts = {row["method"]: row["parts"] for row in result["rows"] if row["parts"]}
     kinds = ("", ", start", ", searching")
     assert set(parts) == {f"{name}{kind}" for name in ("default", "paper") for kind in kinds}

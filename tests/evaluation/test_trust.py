@@ -51,9 +51,7 @@ def test_each_frame_is_of_one_kind() -> None:
     joints[2, 4, 1] += 0.1  # one joint 100 mm away: mean 4.8 mm
     figures = figures_of(joints, flags("......xx"), true)
     assert figures.usable_pct == 100 * 4 / 8
-    assert figures.partly_pct == 100 * 1 / 8
-    assert figures.silent_pct == 100 * 1 / 8
-    assert figures.false_alarm_pct == 100 * 1 / 8
+    assert figures.partly_pct == figures.silent_pct == figures.false_alarm_pct == 100 * 1 / 8
     assert (figures.frames, figures.visible, figures.longest_silent) == (8, 8, 1)
     assert figures.mean_mm == pytest.approx((0 + 39.9 + 100 / J + 0 + 0 + 60) / 6)
     assert figures.mean_all_mm == pytest.approx((0 + 39.9 + 100 / J + 0 + 0 + 60 + 60 + 10) / 8)

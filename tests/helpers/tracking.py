@@ -5,6 +5,7 @@ The recording is rendered from a mesh, by a renderer that is not ours, and carri
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
 from functools import cache
@@ -17,9 +18,10 @@ from omegaconf import DictConfig
 
 from toftrack.api import build_tracker
 from toftrack.configuration.compose import modest_files
-from toftrack.devices.base import Device
+from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import Estimate
+from toftrack.frames.frame import Frame
 from toftrack.programs.track import track
 from toftrack.tracking.tracker import Tracker
 
@@ -78,6 +80,28 @@ def sample() -> Scene:
     camera = device.camera
     depth = np.stack([camera.rectify(frame.depth, frame.radial) for frame in device])
     return Scene(depth, np.array(camera.K), device.truth.joints_m.astype(np.float64))
+
+
+class Camera(BaseDevice):
+    """One that gives so many frames of the sample, of every so many one, and fails thereafter."""
+
+    def __init__(
+        self,
+        count: int,
+        every: int = 1,
+        live: bool = True,
+        fails: type[BaseException] | None = None,
+    ) -> None:
+        self._sample, self._every, self._fails = Sample(stop=count * every), every, fails
+        super().__init__(self._sample.camera, 25.0, live=live)
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in self._sample:
+            if frame.index % self._every == 0:
+                self.dropped = frame.index // self._every * (self._every - 1)
+                yield frame
+        if self._fails is not None:
+            raise self._fails("the camera was unplugged")
 
 
 def configuration(*overrides: str, name: str = "config") -> DictConfig:

@@ -42,10 +42,8 @@ SAMPLE = ROOT / "toftrack" / "data" / "sample.npz"
 def tracked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of a run over a recording of twelve frames, which lies beside it."""
     folder = tmp_path_factory.mktemp("tracked")
-    with np.load(SAMPLE) as archive:
-        arrays = {key: archive[key] for key in archive.files}
-    rows = len(arrays["depth_m"])
-    short = {key: v[:FRAMES] if v.ndim and len(v) == rows else v for key, v in arrays.items()}
+    with np.load(SAMPLE) as whole:
+        short = {key: v[:FRAMES] if v.shape[:1] == (100,) else v for key, v in whole.items()}
     np.savez(folder / "hand.npz", **short)
     given = ("device=replay", "device.path=hand.npz", "view=none", "hydra.run.dir=run")
     status, _, err = programs.call(*given, *QUICK, folder=folder)
@@ -80,12 +78,23 @@ def undrawn(draws_only: Callable[..., None]) -> None:
     draws_only()
 
 
-def change(run: Path, **arrays: Callable[[np.ndarray], np.ndarray]) -> None:
-    """Change arrays of the run's track.npz."""
-    with np.load(run / "track.npz") as archive:
-        content = {key: archive[key] for key in archive.files}
+def change(path: Path, **arrays: Callable[[np.ndarray], object]) -> None:
+    """Change arrays of a file; those of which None is left go."""
+    with np.load(path) as archive:
+        content = dict(archive)
     content |= {key: edit(content[key]) for key, edit in arrays.items()}
-    np.savez(run / "track.npz", **content)
+    np.savez(path, **{key: value for key, value in content.items() if value is not None})
+
+
+def edited(edit: Callable[[dict], object]) -> Callable[[np.ndarray], np.ndarray]:
+    """For `change`: the metadata, of which something was edited."""
+
+    def changed(metadata: np.ndarray) -> np.ndarray:
+        content = json.loads(metadata.item())
+        edit(content)
+        return np.array(json.dumps(content))
+
+    return changed
 
 
 def share(picture: np.ndarray, colour: str | tuple[int, ...]) -> float:
@@ -156,12 +165,11 @@ def test_five_figures_are_written_that_show_something(run: Path) -> None:
 
 
 def test_the_papers_run_is_drawn_though_json_has_no_infinity(run: Path, undrawn: None) -> None:
-    with np.load(run / "track.npz") as archive:
-        facts = json.loads(str(archive["metadata"]))
-    assert isinstance(facts["config"]["segmentation"]["reach_m"], float)
-    facts["config"]["segmentation"]["reach_m"] = None
-    change(run, metadata=lambda _: np.array(json.dumps(facts)))
-    assert (run / "run.json").is_file()
+    def endless(facts: dict) -> None:
+        assert isinstance(facts["config"]["segmentation"]["reach_m"], float)
+        facts["config"]["segmentation"]["reach_m"] = None
+
+    change(run / "track.npz", metadata=edited(endless))
     assert draw_figures(run)
 
 
@@ -180,7 +188,7 @@ def test_lost_frames_are_shown_and_shaded(
 ) -> None:
     draws_only("lost", "course")
     before = draw_figures(run, out=tmp_path / "before")
-    change(run, lost=lambda lost: np.arange(len(lost)) >= 8)
+    change(run / "track.npz", lost=lambda lost: np.arange(len(lost)) >= 8)
     after = draw_figures(run, out=tmp_path / "after")
     for name in ("lost", "course"):
         old, new = (
@@ -201,7 +209,7 @@ def test_two_hands_have_figures_of_their_own_and_one_filmstrip(
         return np.stack([values, second], 1)
 
     with np.load(run / "track.npz") as archive:
-        change(run, **{name: beside for name in HAND_FIELDS if name in archive})
+        change(run / "track.npz", **{name: beside for name in HAND_FIELDS if name in archive})
     shutil.copy(run / "hand_shape.json", run / "hand_shape_2.json")
     summary = json.loads((run / "summary.json").read_text())
     summary["metrics"]["slot"] = 0
@@ -231,21 +239,17 @@ def test_two_hands_have_figures_of_their_own_and_one_filmstrip(
 
 def test_without_truth_the_score_stands_alone(run: Path, draws_only: Callable[..., None]) -> None:
     draws_only("course")
-    with np.load(run.parent / "hand.npz") as archive:
-        kept = {key: archive[key] for key in archive.files if key != "joints_m"}
-    np.savez(run.parent / "hand.npz", **kept)
+    change(run.parent / "hand.npz", joints_m=lambda _: None)
     course = next(p for p in draw_figures(run, run.parent / "hand.npz") if p.stem == "course")
     picture = cv2.imread(str(course))
     assert share(picture, chart.GREEN) > 0 and share(picture, chart.BLUE) == 0
 
 
-def test_a_space_that_has_changed_is_reported_and_used_anew(
-    run: Path,
-) -> None:
+def test_a_space_that_has_changed_is_reported_and_used_anew(run: Path) -> None:
     before, note = runs.latents(read_run(run), read_run(run).pose_space())
     assert note == ""
     np.testing.assert_array_equal(before, read_run(run).results["latent"])
-    change(run, latent=lambda latent: latent + 1)
+    change(run / "track.npz", latent=lambda latent: latent + 1)
     after, note = runs.latents(read_run(run), read_run(run).pose_space())
     assert "changed" in note
     np.testing.assert_allclose(after, before, atol=1e-3)
@@ -254,12 +258,8 @@ def test_a_space_that_has_changed_is_reported_and_used_anew(
 def test_a_live_run_gets_the_figures_that_need_no_images(
     run: Path, undrawn: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def live(metadata: np.ndarray) -> np.ndarray:
-        content = json.loads(metadata.item())
-        content["device"] = {"device": "sr3000"}
-        return np.array(json.dumps(content))
-
-    change(run, metadata=live)
+    live = edited(lambda facts: facts.update(device={"device": "sr3000"}))
+    change(run / "track.npz", metadata=live)
     assert [path.stem for path in draw_figures(run)] == ["course", "latent"]
     assert "live camera" in capsys.readouterr().err
     # A recording that was made beside it can be named.
@@ -290,21 +290,14 @@ def test_a_recording_that_moved_is_asked_for(run: Path, tracked: Path, undrawn: 
 def test_another_recording_is_refused(run: Path) -> None:
     with pytest.raises(ToftrackError, match="has 100 frames instead of 12"):
         draw_figures(run, SAMPLE)
-    path = run.parent / "hand.npz"
-    with np.load(path) as archive:
-        arrays = {key: archive[key] for key in archive.files}
-    np.savez(path, **arrays | {"fps": 10.0})
+    change(run.parent / "hand.npz", fps=lambda fps: fps / 2)
     with pytest.raises(ToftrackError, match="other times"):
-        draw_figures(run, path)
+        draw_figures(run, run.parent / "hand.npz")
 
 
 def test_a_run_says_no_code_to_execute(run: Path) -> None:
-    def spoilt(metadata: np.ndarray) -> np.ndarray:
-        content = json.loads(metadata.item())
-        content["config"]["likelihood"] = {"_target_": "os.system", "command": "true"}
-        return np.array(json.dumps(content))
-
-    change(run, metadata=spoilt)
+    spoilt = {"likelihood": {"_target_": "os.system", "command": "true"}}
+    change(run / "track.npz", metadata=edited(lambda facts: facts["config"].update(spoilt)))
     with pytest.raises(ToftrackError, match="likelihood of its own: os.system"):
         draw_figures(run)
 

@@ -6,14 +6,13 @@ import csv
 import json
 import socket
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from helpers.programs import QUICK
-from helpers.tracking import run, sample
+from helpers.tracking import Camera, run, sample
 
 import toftrack
 from toftrack.devices.replay import Sample
@@ -32,26 +31,6 @@ def results(tracking: toftrack.Tracking) -> toftrack.Results:
     return tracking.results()
 
 
-class Camera(toftrack.BaseDevice):
-    """The sample's frames; `fails` after two of them."""
-
-    def __init__(self, fails: type[BaseException] | None = None, live: bool = False) -> None:
-        self.sample, self.fails, self.opened = Sample(stop=4), fails, 0
-        super().__init__(self.sample.camera, self.sample.fps, live=live)
-
-    def open(self) -> None:
-        self.opened += 1
-
-    def close(self) -> None:
-        self.opened -= 1
-
-    def __iter__(self) -> Iterator[toftrack.Frame]:
-        for frame in self.sample:
-            if self.fails and frame.index == 2:
-                raise self.fails("the camera was unplugged")
-            yield frame
-
-
 def test_the_estimates_and_results_are_those_of_the_command_line(
     tracking: toftrack.Tracking, results: toftrack.Results, tmp_path: Path
 ) -> None:
@@ -63,11 +42,8 @@ def test_the_estimates_and_results_are_those_of_the_command_line(
         values = [np.asarray(getattr(one, name), of_run[name].dtype) for one in estimates]
         assert np.array_equal(getattr(results, name), of_run[name], equal_nan=name == "covariance")
         assert np.array_equal(np.array(values).reshape(of_run[name].shape), of_run[name])
-    again = results.estimates(-1)[1]
-    assert (again.side, again.confidence) == (
-        estimates[-1].side,
-        np.float32(estimates[-1].confidence),
-    )
+    again, last = results.estimates(-1)[1], estimates[-1]
+    assert (again.side, again.confidence) == (last.side, np.float32(last.confidence))
     assert str(results) == "<Results: 3 frames, 2 slots, 0% lost>" and "joints_m" in dir(results)
     with pytest.raises(AttributeError, match="no array 'joint_m'; it has index, .*joints_m"):
         _ = results.joint_m
@@ -87,10 +63,7 @@ def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_pa
     with (tmp_path / "hand.csv").open() as stream:
         rows = list(csv.DictReader(stream))
     assert [(row["index"], row["slot"]) for row in rows][-2:] == [("2", "0"), ("2", "1")]
-    for name, words in (
-        ("hand.txt", "end in .npz, .jsonl or .csv"),
-        ("a/b.csv", "cannot be written"),
-    ):
+    for name, words in (("hand.txt", "in .npz, .jsonl or .csv"), ("a/b.csv", "cannot be written")):
         with pytest.raises(toftrack.ToftrackError, match=words):
             results.save(tmp_path / name)
 
@@ -117,8 +90,17 @@ def test_results_become_a_table_of_pandas(
 
 
 def test_the_device_is_closed_however_the_loop_ends() -> None:
+    class Counted(Camera):
+        opened = 0
+
+        def open(self) -> None:
+            self.opened += 1
+
+        def close(self) -> None:
+            self.opened -= 1
+
     for fails, leaves in ((None, False), (None, True), (toftrack.ToftrackError, False)):
-        camera = Camera(fails)
+        camera = Counted(3, live=False, fails=fails)
         try:
             for estimate in toftrack.track(camera, *PAPER):
                 assert camera.opened == 1
@@ -134,16 +116,16 @@ def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:
         ([tmp_path / "gone.npz"], "there is no file"),
         (["device=sample", "hand.syde=left"], "did you mean"),
         (["device=sample", "a.npz"], "both give the frames"),
-        ([Camera(), "device.stop=2"], "track was given a device, a Camera; leave one out"),
+        ([Camera(3), "device.stop=2"], "track was given a device, a Camera; leave one out"),
     ):
         with pytest.raises(toftrack.ToftrackError, match=said):
             toftrack.track(*words)
 
 
 def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:
-    assert len(toftrack.track(Camera(KeyboardInterrupt, live=True), *PAPER).results().lost) == 2
+    assert len(toftrack.track(Camera(2, fails=KeyboardInterrupt), *PAPER).results().lost) == 2
     with pytest.raises(KeyboardInterrupt):
-        toftrack.track(Camera(KeyboardInterrupt), *PAPER).results()
+        toftrack.track(Camera(2, live=False, fails=KeyboardInterrupt), *PAPER).results()
     ended = toftrack.PushDevice(Sample().camera)
     ended.end()
     with pytest.raises(toftrack.ToftrackError, match="no frame"):

@@ -12,7 +12,7 @@ from helpers.fake_orbbec import DEPTH, IR, Images, Sdk, image, profile
 from helpers.fake_orbbec import Camera as FakeCamera
 from helpers.programs import QUICK, interrupted_when, killed_when
 from helpers.settings import orbbec, realsense, realsense_emulator, sr3000, sr3000_emulator
-from helpers.tracking import run
+from helpers.tracking import Camera, run
 
 from toftrack.devices.base import BaseDevice, Device
 from toftrack.devices.realsense.device import load_sdk
@@ -100,26 +100,12 @@ def test_a_run_keeps_what_it_saw_and_tracking_that_gives_the_same(
         np.testing.assert_array_equal(live[name], again[name], err_msg=name)
 
 
-class Some(BaseDevice):
-    """A live camera that drops every second frame, and breaks."""
-
-    def __init__(self) -> None:
-        self._sample = Sample(stop=2 * FEW)
-        super().__init__(self._sample.camera, 25.0, live=True)
-
-    def __iter__(self) -> Iterator[Frame]:
-        for frame in self._sample:
-            if frame.index % 2 == 0:
-                yield frame
-        raise ToftrackError("the camera was unplugged")
-
-
 def test_what_came_before_an_error_is_kept_with_gaps_where_frames_were_dropped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    camera = Camera(FEW, every=2, fails=ToftrackError)
     with pytest.raises(ToftrackError, match="unplugged"):
-        run(tmp_path / "run", Some(), *TRACK, f"record={tmp_path / 'a.npz'}")
-    camera = Some()
+        run(tmp_path / "run", camera, *TRACK, f"record={tmp_path / 'a.npz'}")
     with pytest.raises(ToftrackError, match="unplugged"):
         record_frames(camera, Recorder(tmp_path / "b.npz", camera, 1.0))
     assert f"{tmp_path / 'b.npz'}: {FEW} frames" in capsys.readouterr().out

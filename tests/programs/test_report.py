@@ -12,7 +12,7 @@ import pytest
 import yaml
 
 from toftrack.errors import ToftrackError
-from toftrack.programs.report import group_runs, main, read_runs, report, sweep_figure
+from toftrack.programs.report import Group, group_runs, main, read_runs, report, sweep_figure
 
 
 def job(
@@ -130,6 +130,6 @@ def test_a_folder_without_jobs_is_one_clear_error(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("error", [0.0, 3e4])
 def test_the_plot_holds_errors_of_any_size(error: float) -> None:
-    points = [("one", 20.0, error, None), ("two", 20.0, error, error / 2), ("three", 0.0, 1.0, 0)]
-    picture = sweep_figure(points, "mm")
+    points = [("one", error, None, 20.0), ("two", error, error / 2, 20.0), ("three", 1.0, 0, 0.0)]
+    picture = sweep_figure([Group(name, [], *numbers, {}) for name, *numbers in points], "mm")
     assert picture.dtype == np.uint8 and picture.std() > 0

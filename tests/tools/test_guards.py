@@ -13,8 +13,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.recordings.store import open_recording
 
 sys.path.insert(0, str(Path(__file__).parent))
-from breaks import BREAKS
-from guards import BOUNDS, DATA, SAMPLE_MM, complaints
+from guards import BOUNDS, BREAKS, DATA, SAMPLE_MM, complaints
 
 GOOD = {"seed": 0.0, **{name: (low + high) / 2 for name, (low, high) in BOUNDS.items()}}
 SAMPLE = {"seed": 0.0, "sample_mm": SAMPLE_MM - 0.5, "sample_lost_pct": 0.0}

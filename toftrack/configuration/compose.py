@@ -76,9 +76,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
         name = _ROOT.removesuffix(".yaml")
         try:
             config = compose(name, overrides=list(overrides))
-        except (HydraException, OmegaConfBaseException):
-            raise
-        except ToftrackError:
+        except (HydraException, OmegaConfBaseException, ToftrackError):
             raise
         except Exception as error:  # whatever the readers of YAML say of somebody's file
             raise ToftrackError(sentence(error)) from error

@@ -36,7 +36,10 @@ def sentence(error: BaseException) -> str:
             return _one_line(str(cause))
     for cause in chain:
         if isinstance(cause, MissingMandatoryValue):
-            return _of_missing_value(cause)
+            missing = cause.full_key or str(cause).rpartition(" ")[2]
+            return (
+                f"the value of {missing} is missing; give it on the command line as {missing}=VALUE"
+            )
         if (path := _read_by_hydra(cause)) and not isinstance(cause, HydraException):
             reason = _one_line(str(cause))
             return (
@@ -109,11 +112,6 @@ def _of_system(error: OSError) -> str:
         f"'{os.fsdecode(error.filename)}' cannot be read or written ({reason}); check the path and "
         "its permissions, or choose another output folder with hydra.run.dir=DIR"
     )
-
-
-def _of_missing_value(error: MissingMandatoryValue) -> str:
-    name = error.full_key or str(error).rpartition(" ")[2]
-    return f"the value of {name} is missing; give it on the command line as {name}=VALUE"
 
 
 def _of_config(error: BaseException) -> str:
@@ -204,8 +202,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     last = key.rpartition(".")[2]
     same = [name for name in keys if name.rpartition(".")[2] == last]
     meant = key.removesuffix(last) + _MEANT.get(last, last)
-    likely = _nearest(meant, [name for name in keys if not key.startswith(f"{name}.")])
-    likely = likely or next(iter(same), None)
+    others = [name for name in keys if not key.startswith(f"{name}.")]
+    likely = _nearest(meant, others) or next(iter(same), None)
     text = f"there is no setting {key}"
     if key == "device.path":
         if "device.bag" in keys:
@@ -213,14 +211,10 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
     if likely is not None:
         return f"{text}; did you mean {likely}?"
-    where = key.rpartition(".")[0]
-    while where and not isinstance(OmegaConf.select(root, where), DictConfig):
-        where = where.rpartition(".")[0]
-    inside = OmegaConf.select(root, where) if where else root
-    some = [str(name) for name in inside if name not in ("_target_", "hydra")]
+    some = [str(name) for name in parent if name not in ("_target_", "hydra")]
     if len(some) > _MOST:
         some = [*some[:_MOST], "..."]
-    return f"{text}; {where or 'the configuration'} has {', '.join(some)}"
+    return f"{text}; {parent._get_full_key(None) or 'the configuration'} has {', '.join(some)}"
 
 
 def _keys(config: object, prefix: str = "") -> Iterator[str]:

@@ -168,17 +168,13 @@ def _peer(hands: int, python: str) -> Iterator[Runner]:
     """MediaPipe, which times itself, in its process."""
     with make_device("device=sample") as device:
         camera, frames = device.camera, list(device)
-    images = [(camera.rectify(f.depth, f.radial), f.amplitude) for f in frames]
+    images = [(camera.rectify(f.depth, f.radial), np.asarray(f.amplitude)) for f in frames]
     images += images[-2:0:-1]
     with Peer(python) as peer:
         peer.begin(camera, "right", hands)
 
         def once() -> list[float]:
-            found = []
-            for depth, amplitude in images:
-                assert amplitude is not None, "the packaged recording has amplitudes"
-                found.append(1e3 * peer.step(depth, amplitude).compute_s)
-            return found
+            return [1e3 * peer.step(*image).compute_s for image in images]
 
         once()
         yield once

@@ -82,10 +82,11 @@ def result_of(rows: Sequence[Row]) -> dict[str, Any]:
     for name in dict.fromkeys(row["recording"].partition("#")[0] for row in rows if "kind" in row):
         mine = [row for row in rows if "kind" in row and row["recording"].startswith(f"{name}#")]
         images[name] = image_totals(mine)
-        shown = sorted({row["shown"] for row in mine if "shown" in row}, key=_number)
+        shown = {row["shown"] for row in mine if "shown" in row}
         if shown:
             images[name]["by"] = {
-                of: image_totals([row for row in mine if row["shown"] == of]) for of in shown
+                of: image_totals([row for row in mine if row["shown"] == of])
+                for of in sorted(shown, key=lambda of: (int(of) if of.isdecimal() else 0, of))
             }
     return {
         "total": totals(true) if true else None,
@@ -94,10 +95,6 @@ def result_of(rows: Sequence[Row]) -> dict[str, Any]:
         "groups": groups(true),
         "rows": rows,
     }
-
-
-def _number(text: str) -> tuple[int, str]:
-    return (int(text) if text.isdecimal() else 0), text
 
 
 def read_rows(path: Path) -> list[Row]:

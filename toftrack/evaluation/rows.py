@@ -194,7 +194,8 @@ def interval_name(key: str) -> str:
 
 
 def groups(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
-    """By kind of group and group: figures over its frames, pooled; see the head of this module."""
+    """By kind of group and group: figures over its frames, pooled; see the head of this module.
+    Bands are in the order of their values, other groups in that of their names."""
     sums: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
         for kind, found in row.get("groups", {}).items():
@@ -204,7 +205,10 @@ def groups(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
                     mine[key] = mine.get(key, 0) + value
     seeds = max(len({row["seed"] for row in rows}), 1)
     return {
-        kind: {name: _group_figures(found[name], seeds) for name in sorted(found, key=_order)}
+        kind: {
+            name: _group_figures(found[name], seeds)
+            for name in sorted(found, key=lambda name: (not name.startswith("below "), name))
+        }
         for kind, found in sums.items()
     }
 
@@ -220,11 +224,6 @@ def _group_figures(counts: Mapping[str, float], seeds: int) -> Row:
         "mean_mm": rounded(counts["error_sum_mm"] / said) if said else None,
         "gesture_pct": pct("called_right", "named"),
     }
-
-
-def _order(name: str) -> tuple[bool, str]:
-    """Bands in the order of their values, other groups in that of their names."""
-    return not name.startswith("below "), name
 
 
 def _length_mm(truth: Truth) -> float:

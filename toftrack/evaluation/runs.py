@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,9 +29,8 @@ from toftrack.frames.frame import Truth
 from toftrack.recordings.npz import read_recording
 
 SIDES = ("told", "auto")
-FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
-"""What the tracker's estimates are measured by."""
-_PEER_FIELDS = ("joints_m", "lost")
+_FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
+"""What estimates are measured by; a peer's have the first two alone."""
 _SIDE_FIELDS = ("side", "side_probability")
 """What is measured besides where the side is found out."""
 
@@ -99,8 +99,7 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
 
 def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
     """None where there is neither truth nor labels."""
-    recording = read_recording(file)
-    try:
+    with closing(read_recording(file)) as recording:
         name = f"{file.absolute().parent.name}/{file.stem}"
         count, size = len(recording), (recording.camera.width, recording.camera.height)
         if recording.truth is not None:
@@ -117,8 +116,6 @@ def _source(file: Path, known: Sequence[Points | Stills]) -> Source | None:
                 f"'{file}'; give one of them at a time"
             )
         return Source(file, name, count, fitting[0]) if fitting else None
-    finally:
-        recording.close()
 
 
 def jobs(
@@ -207,10 +204,9 @@ def _true_rows(job: Job, device: Replay) -> list[Row]:
             "and so no side can be given; give --side auto"
         )
     reported, others = _tracked(device, job, truth.side)
-    rows = [_row(job, device, truth, reported, FIELDS)]
+    rows = [_row(job, device, truth, reported)]
     if others:
-        of_peer = _row(job, device, truth, [(one,) for one in others], _PEER_FIELDS)
-        rows.append({"method": PEER, **of_peer})
+        rows.append({"method": PEER, **_row(job, device, truth, [(one,) for one in others])})
     return rows
 
 
@@ -219,9 +215,8 @@ def _row(
     device: Replay,
     truth: Truth,
     reported: Sequence[Sequence[Estimate | PeerEstimate]],
-    fields: Sequence[str],
 ) -> Row:
-    track = estimates_of(reported, (*fields, *(_SIDE_FIELDS if job.side == "auto" else ())))
+    track = estimates_of(reported, with_side=job.side == "auto")
     compute_s = np.array([frame[0].compute_s for frame in reported])
     found = measured(track, truth)
     about = device.metadata
@@ -259,16 +254,17 @@ def _tracked(
 
 
 def estimates_of(
-    reported: Sequence[Sequence[Estimate | PeerEstimate]], fields: Sequence[str] = FIELDS
+    reported: Sequence[Sequence[Estimate | PeerEstimate]], with_side: bool = False
 ) -> Estimates:
     """What was said in T frames of each slot, by those fields of Estimates that the reported ones
-    have; with one slot without its axis."""
+    have, with the side where it was found out; with one slot without its axis."""
+    names = (*_FIELDS, *(_SIDE_FIELDS if with_side else ()))
 
     def column(name: str) -> np.ndarray:
         values = np.array([[getattr(one, name) for one in frame] for frame in reported])
         return values[:, 0] if values.shape[1] == 1 else values
 
-    return Estimates(**{name: column(name) for name in fields})
+    return Estimates(**{name: column(name) for name in names if hasattr(reported[0][0], name)})
 
 
 def _points(job: Job, device: Replay, labels: Points) -> Iterator[tuple[int, Row]]:

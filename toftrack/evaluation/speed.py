@@ -39,7 +39,6 @@ from toftrack.tracking.backend import BACK_ENDS, make_scorer
 PARTICLES = (100, 300, 1000, 3000, 10_000)
 BASELINES = {"stepping": 3, "naive": 5}
 """The baselines and how often each is timed."""
-SPACES = tuple(KINDS)
 CONFIGURATIONS: dict[str, tuple[str, ...]] = {"default": (), "paper": ("experiment=paper",)}
 PARTS = (
     "rectification",
@@ -176,7 +175,7 @@ def score_times(
 def decode_times(seconds: float, device: torch.device) -> list[Row]:
     """The decoding of latents drawn from the box of each space."""
     calls: dict[str, Callable[[], object]] = {}
-    for kind in SPACES:
+    for kind in KINDS:
         space = fit_pose_space(kind, 4).to(device)
         generator = torch.Generator(device).manual_seed(0)
         unit = torch.rand(_LATENTS, space.dims, generator=generator, device=device)

@@ -26,12 +26,10 @@ compiles another half."""
 @contextmanager
 def compiling_ahead() -> Iterator[None]:
     """Within, a second process compiles if nothing is compiled yet and there are cores for both."""
-    if not nothing_kept() or _cores() < 2:
-        yield
-        return
     helper = None
-    with suppress(OSError):
-        helper = _helper()
+    if nothing_kept() and _cores() > 1:
+        with suppress(OSError):
+            helper = _helper()
     try:
         yield
     finally:

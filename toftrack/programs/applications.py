@@ -174,7 +174,7 @@ def options_first(arguments: Sequence[str]) -> list[str]:
 
 def _check_option(word: str) -> None:
     """ToftrackError for an option that is none of Hydra's, which would print all that it has."""
-    if not any(map(word.startswith, _SHORT)) and not any(o.startswith(word) for o in _LONG):
+    if not word.startswith(_SHORT) and not any(o.startswith(word) for o in _LONG):
         raise ToftrackError(
             f"there is no option {word}; settings are given as KEY=VALUE, without dashes and "
             "blanks, and --help tells which"

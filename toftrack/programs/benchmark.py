@@ -19,6 +19,7 @@ from toftrack.programs.command_line import plain_parser
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a measurement. Raises ToftrackError."""
     given = sys.argv[1:] if arguments is None else list(arguments)
+    kinds = {"alternating": _alternating, "accuracy": _accuracy, "ablation": _ablation}
     if given[:1] in (["-h"], ["--help"]):
         print(
             "usage: toftrack benchmark [speed] ...       how fast hypotheses and frames are\n"
@@ -27,12 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"
             "toftrack benchmark speed --help and so on say more"
         )
-    elif given[:1] == ["alternating"]:
-        _alternating(given[1:])
-    elif given[:1] == ["accuracy"]:
-        _accuracy(given[1:])
-    elif given[:1] == ["ablation"]:
-        _ablation(given[1:])
+    elif given and given[0] in kinds:
+        kinds[given[0]](given[1:])
     else:
         _speed(given[1:] if given[:1] == ["speed"] else given)
 

@@ -190,7 +190,6 @@ def _report(error: BaseException, job: str = "") -> int:
 # Hydra makes the folder of a run, with its own files in it, before the program has looked at its
 # settings: that of one that failed before it wrote anything of its own goes away again.
 _HYDRAS = frozenset({"config.yaml", "hydra.yaml", "overrides.yaml"})
-_SWEEPS = "multirun.yaml"
 _new_folders: dict[Path, tuple[Path, ...]] = {}
 """Of a run or sweep, with those of them and their parents that were not there, the innermost
 first."""
@@ -227,11 +226,12 @@ class FailedJobs(Callback):
 def _given(config: DictConfig, kind: str) -> Path:
     try:
         check_interpolations(config)
-    except ToftrackError as large:
-        raise _JobFailedError(large) from large
-    if not (folder := config.hydra[kind].dir):  # which would be the current one
-        error = ToftrackError(f"hydra.{kind}.dir is empty; give a folder, or . for the current one")
-        raise _JobFailedError(error)
+        if not (folder := config.hydra[kind].dir):  # which would be the current one
+            raise ToftrackError(
+                f"hydra.{kind}.dir is empty; give a folder, or . for the current one"
+            )
+    except ToftrackError as error:
+        raise _JobFailedError(error) from error
     return Path(folder)
 
 
@@ -269,9 +269,8 @@ def _clear(folder: Path, new: tuple[Path, ...]) -> None:
     """Remove a folder that holds nothing but what Hydra put there."""
     files = [path for path in folder.glob("*") if path.name != ".hydra"]
     inner = list(folder.glob(".hydra/*"))
-    if any(path.suffix != ".log" and path.name != _SWEEPS for path in files):
-        return
-    if any(path.name not in _HYDRAS for path in inner):
+    others = [path for path in files if path.suffix != ".log" and path.name != "multirun.yaml"]
+    if others or any(path.name not in _HYDRAS for path in inner):
         return
     for handler in list(logging.root.handlers):  # Windows removes no file that is open
         if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename) in files:

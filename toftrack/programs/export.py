@@ -67,8 +67,6 @@ def _contents(run: Run, kind: str) -> dict[str, bytes]:
 
 _CM = 100.0
 _ROTATIONS = "Zrotation Xrotation Yrotation"
-_LEFT_OUT = ("palm",)
-"""It does not move by itself."""
 
 
 def bvh_of(motion: HandMotion) -> str:
@@ -78,10 +76,8 @@ def bvh_of(motion: HandMotion) -> str:
     _describe(OPENXR_JOINT_NAMES.index("wrist"), 0, motion, lines, order)
     seconds = float(np.median(np.diff(motion.time_s))) if len(motion.time_s) > 1 else 1 / 25
     lines += ["MOTION", f"Frames: {len(motion.time_s)}", f"Frame Time: {seconds:.6f}"]
-    rotations = Rotation.from_quat(motion.turn[:, order].reshape(-1, 4)).as_euler(
-        "ZXY", degrees=True
-    )
-    angles = np.unwrap(rotations.reshape(len(motion.time_s), -1), axis=0, period=360)
+    turns = Rotation.from_quat(motion.turn[:, order].reshape(-1, 4)).as_euler("ZXY", degrees=True)
+    angles = np.unwrap(turns.reshape(len(motion.time_s), -1), axis=0, period=360)
     rows = np.concatenate((_CM * motion.offset_m[:, order[0]], angles), 1)
     lines += [" ".join(f"{value:.4f}" for value in row) for row in rows]
     return "\n".join(lines) + "\n"
@@ -92,10 +88,11 @@ def _describe(
 ) -> None:
     """Append a joint's part of the hierarchy and all below it, and its number to the order."""
     indent = "  " * depth
+    # The palm is left out, which does not move by itself.
     children = [
         child
         for child, parent in enumerate(OPENXR_PARENTS)
-        if parent == joint and OPENXR_JOINT_NAMES[child] not in _LEFT_OUT
+        if parent == joint and OPENXR_JOINT_NAMES[child] != "palm"
     ]
     # The place of the root is a channel.
     offset = _CM * motion.rest_offset_m[joint] if depth else np.zeros(3)

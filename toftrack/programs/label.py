@@ -23,10 +23,7 @@ from pathlib import Path
 from hydra.utils import instantiate
 from omegaconf import DictConfig
 
-from toftrack.configuration.compose import (
-    configuration,
-    one_sentence,
-)
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, check_number
 from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track

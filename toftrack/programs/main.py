@@ -82,7 +82,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default this process's; returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
     if not given or given[0] in (*_HELP, "help"):
-        say(overview(), sys.stdout)
+        width = max(map(len, _COMMANDS))
+        lines = [f"  {name:<{width}}  {about}" for name, about in _COMMANDS.items()]
+        say(_OVERVIEW.format(commands="\n".join(lines)), sys.stdout)
         return 0
     name, rest = given[0], given[1:]
     if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
@@ -99,13 +101,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     from toftrack.programs.command_line import run
 
     return run(lambda: _program(name)(rest))
-
-
-def overview() -> str:
-    """What `toftrack --help` prints."""
-    width = max(map(len, _COMMANDS))
-    lines = [f"  {name:<{width}}  {about}" for name, about in _COMMANDS.items()]
-    return _OVERVIEW.format(commands="\n".join(lines))
 
 
 def long_help(name: str) -> str:

@@ -68,9 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     assert isinstance(device, Sr3000)
     with device:
-        interrupted = _record_raw(device, options)
-    if interrupted is not None:
-        raise EndedError(interrupted)
+        _record_raw(device, options)
 
 
 def record_frames(
@@ -106,13 +104,12 @@ def record_frames(
         raise ToftrackError("the device delivered no frame; nothing was recorded")
 
 
-def _record_raw(device: Sr3000, options: argparse.Namespace) -> int | None:
+def _record_raw(device: Sr3000, options: argparse.Namespace) -> None:
     """Write every frame of an opened camera (keep=every) to a `.srs` file, until there are so many
     frames, seconds or gigabytes.
 
-    A signal ends it after the frames that were received until then, and its number is returned.
-    Raises ToftrackError when the file cannot be written, or the camera was given up; the frames
-    until then are in the file.
+    Raises ToftrackError when the file cannot be written, or the camera was given up, and EndedError
+    when a signal ended it; the frames that were received until then are in the file.
     """
     facts = device.description
     serial = str(facts.get("serial"))
@@ -153,7 +150,8 @@ def _record_raw(device: Sr3000, options: argparse.Namespace) -> int | None:
             if options.seconds is not None and time.monotonic() - began >= options.seconds:
                 device.request_stop()
     print(f"{options.out}: {writer.frames} frames ({device.counts})")
-    return came[0] if came else None
+    if came:
+        raise EndedError(came[0])
 
 
 def _progress(frames: int | None) -> tqdm:

@@ -236,11 +236,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
             changed = " ".join(f"{k}={value}" for k, value in run.overrides.items() if k in varied)
             print(f"  {run.name} ({changed}): {run.error}")
     written = [folder / "sweep.csv"]
-    points = [
-        (group.settings, group.cost_ms, group.error, group.spread)
-        for group in groups
-        if group.error is not None and group.cost_ms is not None
-    ]
+    points = [group for group in groups if None not in (group.error, group.cost_ms)]
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
         drawn = chart.write_figures(folder, {"sweep.png": lambda: sweep_figure(points, label)})
@@ -266,21 +262,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     report(given.folder[0], given.figure)
 
 
-_Point = tuple[str, float, float, float | None]
-"""(settings, cost in ms, error, spread of the error over seeds or None)"""
-
-
-def sweep_figure(points: Sequence[_Point], label: str) -> np.ndarray:
+def sweep_figure(groups: Sequence[Group], label: str) -> np.ndarray:
     """Numbered dots with bars of one deviation over seeds, a legend below; BGR.
 
-    label: of the error's axis, which starts at zero. The axis of the cost is logarithmic.
+    groups: with an error and a cost.  label: of the error's axis, which starts at zero. The axis of
+    the cost is logarithmic.
     """
-    figure = chart.new_figure(900, 500 + 22 * len(points))
+    figure = chart.new_figure(900, 500 + 22 * len(groups))
     axes = figure.subplots()
     chart.label(axes, "ms a frame", label)
-    for number, (settings, cost_ms, error, spread) in enumerate(points, 1):
-        colour, at = chart.COLOURS[(number - 1) % len(chart.COLOURS)], (max(cost_ms, 1e-3), error)
-        axes.errorbar(*at, spread, fmt="o", color=colour, capsize=5, label=f"{number}  {settings}")
+    for number, group in enumerate(groups, 1):
+        colour = chart.COLOURS[(number - 1) % len(chart.COLOURS)]
+        at, name = (max(group.cost_ms or 0, 1e-3), group.error), f"{number}  {group.settings}"
+        axes.errorbar(*at, group.spread, fmt="o", color=colour, capsize=5, label=name)
         axes.annotate(str(number), at, (7, 5), textcoords="offset points", color=colour)
     chart.round_log_ticks(axes, "x")
     axes.margins(0.15, 0.1)

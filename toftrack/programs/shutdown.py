@@ -124,12 +124,11 @@ def forget_streams() -> None:
 def _request(number: int, frame: FrameType | None) -> None:
     _requests.count += 1
     _requests.first = _requests.first or number
-    if _requests.count == 1 and not _requests.shields:
+    at_once = _requests.count == 1 and not _requests.shields
+    if at_once or _requests.count > 1 + _PATIENCE:
         raise EndedError(number)
     if _requests.count == 1:
         _requests.waiting = number
-    elif _requests.count > 1 + _PATIENCE:
-        raise EndedError(number)
     elif number == signal.SIGINT:
         with suppress(OSError):
             os.write(2, _HINT)  # print is not for the middle of whatever goes on

@@ -67,8 +67,12 @@ def track(config: DictConfig, device: Device) -> float:
 @contextmanager
 def prepared_run(config: DictConfig, device: Device) -> Iterator[Run]:
     """What works in the loop of a configuration; `device` is what it describes, not yet open."""
+    recording: AbstractContextManager[Recorder | None] = nullcontext()
+    if config.get("record") is not None:  # a configuration of one's own may do without
+        limit_gb = config.record_limit_gb
+        recording = Recorder(str(config.record), device, limit_gb, tell=_log.warning)
     # Both tell at once what is wrong with them.
-    with _recorder(config, device) as recorder, instantiate(config.stream) as stream:
+    with recording as recorder, instantiate(config.stream) as stream:
         tracker = build_hands_tracker(config)
         if not device.live:  # recordings have no budget, so that they stay reproducible
             tracker.time.pace = Pace()
@@ -88,13 +92,6 @@ def prepared_run(config: DictConfig, device: Device) -> Iterator[Run]:
         if device.live:
             tracker.prepare()  # a camera does not wait for what is loaded at the first frame
         yield run
-
-
-def _recorder(config: DictConfig, device: Device) -> AbstractContextManager[Recorder | None]:
-    """What keeps the frames; None where nothing is to be kept."""
-    if config.get("record") is None:  # a configuration of one's own may do without
-        return nullcontext()
-    return Recorder(str(config.record), device, config.record_limit_gb, tell=_log.warning)
 
 
 def _track(config: DictConfig, folder: Path, run: Run) -> float:
