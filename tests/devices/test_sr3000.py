@@ -185,8 +185,7 @@ def test_unplugged_between_frames_by_hand() -> None:
         for frame in device:
             indices.append(frame.index)
             if len(indices) == 5:
-                device.emulator.unplug()
-                threading.Timer(0.05, device.emulator.plug_in).start()
+                device.emulator.unplug(0.05)
             if len(indices) == 10:
                 break
     assert indices == sorted(set(indices))

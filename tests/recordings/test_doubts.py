@@ -34,7 +34,7 @@ def test_times_in_another_unit_are_reported_with_the_factor(factor: float, words
 
 
 def test_times_that_stand_still_are_reported() -> None:
-    assert "all time stamps are 3" in times_doubt(np.full(5, 3.0))
+    assert "4 of 5 time stamps repeat" in times_doubt(np.full(5, 3.0))
     assert "57 of 60" in times_doubt(np.floor(np.arange(60) / 25)), "whole seconds"
 
 

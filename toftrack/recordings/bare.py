@@ -69,14 +69,12 @@ def bare_camera(
     """The camera of a file of bare images of that size: as given, else camera.json beside it;
     ToftrackError where there is none, or it is of another size.
     """
-    if camera_file is not None:
-        return Camera.load_for(camera_file, width, height, f"'{path}'")
-    given = bare.camera(width, height)
-    if given is not None:
+    if camera_file is None and (given := bare.camera(width, height)):
         return given
     beside = path.parent / _BESIDE
-    if beside.exists():
-        return Camera.load_for(beside, width, height, f"'{path}'")
+    if camera_file is not None or beside.exists():
+        file = beside if camera_file is None else camera_file
+        return Camera.load_for(file, width, height, f"'{path}'")
     raise ToftrackError(
         f"'{path}' ({width}x{height} pixels) does not say what camera made it; give the lens with "
         "device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY), or a camera "

@@ -263,16 +263,11 @@ def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
             f"{files.what} has images in {len(folders)} folders, {', '.join(folders[:5])}; give "
             "one of them" + (" by itself" if isinstance(files, ZippedFiles) else "")
         )
-    if not others:
-        return depth, amplitude, None
-    return (
-        depth,
-        amplitude,
-        (
-            f"{len(others)} images that are not depth, as '{others[0]}', are left out; depth are "
-            f"'{depth[0]}' and {len(depth) - 1} others"
-        ),
+    left_out = others and (
+        f"{len(others)} images that are not depth, as '{others[0]}', are left out; depth are "
+        f"'{depth[0]}' and {len(depth) - 1} others"
     )
+    return depth, amplitude, left_out or None
 
 
 def _last(name: str) -> str:

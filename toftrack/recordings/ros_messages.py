@@ -34,9 +34,7 @@ def encoding(message: Any, kind: str) -> str:
 def is_depth(words: str) -> bool:
     """An `encoding` is one of depth images."""
     transport = words.partition(";")[2]
-    return words.startswith(("16UC1", "32FC1")) and (
-        not transport or "compressedDepth" in transport or _lossless(words)
-    )
+    return words.startswith(("16UC1", "32FC1")) and (not transport or _lossless(words))
 
 
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
@@ -146,9 +144,7 @@ def decoded_rvl(content: bytes) -> np.ndarray:
 
 def _lossless(words: str) -> bool:
     transport = words.partition(";")[2]
-    if "compressedDepth" in transport:
-        return True
-    return "png" in transport
+    return "compressedDepth" in transport or "png" in transport
 
 
 def _colour(words: str) -> str:

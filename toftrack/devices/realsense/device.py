@@ -196,8 +196,10 @@ def load_sdk(otherwise: str = "") -> ModuleType:
         return _imported()
     except ImportError as error:
         if "libusb" in str(error):
+            # The wheels leave libusb to the system; a loaded one of that name serves, too.
             with contextlib.suppress(ImportError, OSError):
-                _preload_libusb()
+                path = importlib.import_module("libusb_package").get_library_path()
+                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
                 return _imported()
             raise ToftrackError(
                 "pyrealsense2 needs libusb-1.0, which is not installed: pip install "
@@ -214,12 +216,6 @@ def _imported() -> ModuleType:
     if not hasattr(rs, "pipeline") or not hasattr(rs.pipeline, "set_device"):
         raise ImportError("the installed one is older than 2.56 or incomplete")
     return rs
-
-
-def _preload_libusb() -> None:
-    # The wheels of pyrealsense2 leave libusb to the system; a loaded one of that name serves, too.
-    path = importlib.import_module("libusb_package").get_library_path()
-    ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
 
 
 def _found(rs: ModuleType, serial: str | int | None) -> Any:

@@ -88,12 +88,10 @@ class Sr3000(BaseDevice):
         self._usb = usb
         self._transport: Transport
         number = None if serial is None else str(serial)
-        if transport == "usb":
-            self._transport = UsbTransport(usb, self.exposure, number)
-        elif transport == "libmesasr":
+        if transport == "libmesasr":
             self._transport = MesaTransport(libmesasr, self.exposure, number)
-        elif transport == "emulated":
-            backend = self._emulate(emulated)
+        elif transport in ("usb", "emulated"):
+            backend = self._emulate(emulated) if transport == "emulated" else None
             self._transport = UsbTransport(usb, self.exposure, number, backend)
         else:
             raise ToftrackError(

@@ -220,7 +220,7 @@ class EmulatedBackend(IBackend):
         self._opens = self._position = self._splits = self._cycled = 0
         self._last_due_s = -np.inf
         self._plugging = 0
-        self._back_s: float | None = 0.0
+        self._back_s = 0.0
         self._random = np.random.default_rng(0)
 
     @property
@@ -230,17 +230,13 @@ class EmulatedBackend(IBackend):
             over = not self._settings.loop and self._position >= len(self._source)
             return over and not self._queue
 
-    def unplug(self, seconds: float | None = None) -> None:
-        """Pull the cameras out, for some time or (None) until `plug_in`; the scene goes on."""
+    def unplug(self, seconds: float) -> None:
+        """Pull the cameras out for some time; the scene goes on."""
         with self._lock:
             self._plugging += 1
-            self._back_s = None if seconds is None else time.monotonic() + seconds
+            self._back_s = time.monotonic() + seconds
             self._queue.clear()
             self._stalled = False
-
-    def plug_in(self) -> None:
-        with self._lock:
-            self._back_s = 0.0
 
     # What pyusb asks of a backend.
 
@@ -393,7 +389,7 @@ class EmulatedBackend(IBackend):
     # The camera itself.
 
     def _plugged(self) -> bool:
-        return self._back_s is not None and time.monotonic() >= self._back_s
+        return time.monotonic() >= self._back_s
 
     def _check_plugged(self, device: _Id) -> None:
         if device.plugging != self._plugging or not self._plugged():
