@@ -58,7 +58,6 @@ def test_a_sample_is_tracked(name: str, start: int, least: float, one_thread: No
 
 def test_sample_is_the_packaged_recording() -> None:
     device = Sample()
-    assert isinstance(device, BaseDevice)
     assert (device.frames, device.fps) == (100, 25)
     assert (device.camera.width, device.camera.height) == (176, 144)
     assert device.truth.joint_visible.shape == (100, 21)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -143,24 +144,14 @@ def calibrated(recording: Path) -> tuple[Camera, Path]:
     return Camera.load(out), report
 
 
-def parallel(width: int, **depth: object) -> Camera:
-    """A camera whose first row's rays hardly part: radial distance and Z are the same."""
-    return Camera(np.diag((1e5, 1e5, 1)), width, 2000, **depth)
-
-
-def rectified(camera: Camera, radial_m: np.ndarray) -> np.ndarray:
-    return camera.rectify(np.tile(radial_m.astype(np.float32), (2000, 1)), True)[0]
-
-
 def depth_error_m(camera: Camera) -> np.ndarray:
     """What is left of the depth error from 0.3 to 1.5 m."""
     true = np.linspace(0.3, 1.5, 500)
-    flat = parallel(
-        500,
-        depth_polynomial=camera.depth_polynomial,
-        depth_polynomial_range_m=camera.depth_polynomial_range_m,
-    )
-    return rectified(flat, true + wiggle(true)) - true
+    # The rays of its first row hardly part: radial distance and Z are the same.
+    K = np.diag((1e5, 1e5, 1))
+    flat = replace(camera, K=K, width=500, height=2000, distortion=np.zeros(5))
+    measured = np.tile((true + wiggle(true)).astype(np.float32), (2000, 1))
+    return flat.rectify(measured, True)[0] - true
 
 
 def test_finds_the_lens_again(calibrated: tuple[Camera, Path]) -> None:

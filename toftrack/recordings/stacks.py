@@ -58,7 +58,8 @@ class Stack(FrameStore):
         at[self._order[0]] = index
         with _reported(self.path, f"frame {index} of "):
             image = np.asarray(self._images[tuple(at)])
-        depth = image.astype(np.float32) * np.float32(self.unit_m)
+        with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading
+            depth = image.astype(np.float32) * np.float32(self.unit_m)
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         return (depth.T.copy() if self._order[1] > self._order[2] else depth), None
 
