@@ -197,7 +197,7 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("depth_m", None, "no 'depth_m' .*, but .*K, "),
         ("K", None, "missing"),
         ("depth_m", IMAGES[0], "3 dimensions"),
-        ("depth_m", IMAGES[:0], "zero frames"),
+        ("depth_m", IMAGES[:0], "at least one frame"),
         ("depth_m", IMAGES.astype(complex), "float32"),
         ("depth_m", (500 * IMAGES).astype(np.uint16), "millimetres.*/ 1000"),
         ("depth_m", 480 * IMAGES, "millimetres.*/ 1000"),

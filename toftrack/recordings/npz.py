@@ -81,7 +81,6 @@ class StreamedImages:
                 "read in turn only as numbers in C order; save it so (numpy.ascontiguousarray)"
             )
         self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
-        self.size = int(np.prod(header.shape, dtype=object))
         self._images: Generator[np.ndarray] | None = None
         self._latest: tuple[int, np.ndarray] | None = None
 
@@ -288,10 +287,8 @@ def _check_depth(depth: Images, key: str) -> Images:
     whole = depth.dtype.kind in "iu"
     if not whole and depth.dtype.kind != "f":
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
-    if len(depth) == 0:
-        raise ToftrackError(f"'{key}' has zero frames; record at least one")
-    if depth.size == 0:
-        raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
+    if 0 in depth.shape:
+        raise ToftrackError(f"'{key}' is empty, shape {depth.shape}; record at least one frame")
     some = some_images(depth)
     median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:

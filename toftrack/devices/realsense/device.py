@@ -97,7 +97,9 @@ class RealSense(SdkCamera):
                 camera_file,
                 lambda: camera_of(rs, own),
                 transport=transport if bag is None else "recording",
-                **_facts(rs, self._device),
+                model=_info(rs, self._device, "name"),
+                serial=_info(rs, self._device, "serial_number"),
+                firmware=_info(rs, self._device, "firmware_version"),
                 infrared=self._infrared is not None,
                 preset=preset,
                 realtime=bool(realtime),
@@ -226,12 +228,6 @@ def _found(rs: ModuleType, serial: str | int | None) -> Any:
         found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
     otherwise = ", or try it without a camera with device.transport=emulated"
     return found[chosen_serial(list(found), serial, "RealSense", otherwise)]
-
-
-def _facts(rs: ModuleType, device: Any) -> dict[str, Any]:
-    """What the camera says of itself, JSON-able."""
-    names = {"model": "name", "serial": "serial_number", "firmware": "firmware_version"}
-    return {key: _info(rs, device, name) for key, name in names.items()}
 
 
 def _info(rs: ModuleType, device: Any, name: str) -> str:
