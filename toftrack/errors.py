@@ -75,7 +75,8 @@ def check_number(
     whole: only whole numbers are.  remedy: what else to do, added to the sentence.
     """
     number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-    if number and math.isfinite(value) and least <= value <= most and (value > least or not above):
+    finite = number and -math.inf < value < math.inf  # of whole numbers beyond floats, too
+    if finite and least <= value <= most and (value > least or not above):
         return
     bounds = []
     if least > -math.inf:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.devices.base import BaseDevice
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
@@ -216,13 +216,9 @@ class Sample(Replay):
 
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:
-    for name, value in (("start", start), ("stop", stop)):
-        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-        if not whole and not (name == "stop" and value is None):
-            raise ToftrackError(
-                f"{name}={value!r} is not a frame number; give a whole number from 0 to {count}"
-            )
     stop = count if stop is None else stop
+    check_number("start", start, whole=True)
+    check_number("stop", stop, whole=True)
     if not 0 <= start < stop <= count:
         raise ToftrackError(
             f"the frames from start={start} to stop={stop} do not lie in '{path}', which has "

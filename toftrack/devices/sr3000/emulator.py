@@ -23,7 +23,7 @@ import usb.core
 from usb.backend import IBackend
 
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
 
@@ -160,11 +160,9 @@ class EmulatorSettings:
         object.__setattr__(self, "faults", tuple(self.faults))
         object.__setattr__(self, "serials", tuple(map(str, self.serials)))
         _parse_faults(self.faults)
-        if (self.fps is not None and not self.fps > 0) or self.fault_every < 0:
-            raise ToftrackError(
-                "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
-                f"{self.fps} and {self.fault_every}"
-            )
+        check_number("device.emulated.fault_every", self.fault_every, 0, whole=True)
+        if self.fps is not None:
+            check_number("device.emulated.fps", self.fps, 0, above=True)
 
 
 @dataclass(frozen=True)
