@@ -33,13 +33,16 @@ def one_line(text: str) -> str:
 @contextlib.contextmanager
 def reported_errors(what: str, remedy: str, *kinds: type[Exception]) -> Iterator[None]:
     """Errors of some kinds, by default the system's, become one sentence: what, their words, and
-    what to do.
+    what to do. A ToftrackError stays as it is.
     """
     expected = kinds or (OSError,)
     try:
         yield
+    except ToftrackError:
+        raise
     except expected as error:
-        reason = " ".join(str(getattr(error, "strerror", None) or error).split())[:_LONGEST_REASON]
+        words = " ".join(str(getattr(error, "strerror", None) or error).split())
+        reason = words[:_LONGEST_REASON] or type(error).__name__
         raise ToftrackError(f"{what} ({reason}); {remedy}") from error
 
 
@@ -72,7 +75,8 @@ def check_number(
     whole: only whole numbers are.  remedy: what else to do, added to the sentence.
     """
     number = isinstance(value, Integral if whole else Real) and not isinstance(value, bool)
-    if number and math.isfinite(value) and least <= value <= most and (value > least or not above):
+    finite = number and -math.inf < value < math.inf  # of whole numbers beyond floats, too
+    if finite and least <= value <= most and (value > least or not above):
         return
     bounds = []
     if least > -math.inf:

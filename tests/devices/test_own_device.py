@@ -17,7 +17,7 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 
 from toftrack.configuration.sentences import sentence
-from toftrack.devices.base import BaseDevice, Device
+from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
@@ -31,6 +31,12 @@ def from_page(name: str) -> str:
     blocks = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", text, re.DOTALL)
     assert len(blocks) == 1, f"the page has {len(blocks)} blocks marked {name}"
     return blocks[0]
+
+
+@pytest.fixture(autouse=True)
+def _importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_device", raising=False)
 
 
 @pytest.fixture
@@ -49,10 +55,8 @@ def workplace(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def track(workplace: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., tuple[int, str, str]]:
+def track(workplace: Path) -> Callable[..., tuple[int, str, str]]:
     """`python track.py` as it is run in the user's folder, with that in PYTHONPATH."""
-    monkeypatch.syspath_prepend(workplace)
-    monkeypatch.delitem(sys.modules, "my_device", raising=False)
     given = ("--config-dir", "my_conf", "device=raw", "view=none", "hydra.run.dir=out", *QUICK)
     return partial(programs.call, *given, folder=workplace)
 
@@ -72,11 +76,7 @@ def test_the_readmes_camera_is_tracked(workplace: Path, track: Callable) -> None
     assert np.abs(found[..., 2] - sample.truth.joints_m[..., 2]).mean() < 0.01
 
 
-def test_its_own_error_is_reported_in_one_sentence(
-    workplace: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(workplace)
-    monkeypatch.delitem(sys.modules, "my_device", raising=False)
+def test_its_own_error_is_reported_in_one_sentence(workplace: Path) -> None:
     settings = {"path": "nowhere.raw", "width": 176, "height": 144, "focal_px": 200.0}
     device = instantiate({"_target_": "my_device.RawImages"} | settings)
     with pytest.raises(ToftrackError) as caught, device:
@@ -117,12 +117,10 @@ def test_what_goes_wrong_is_told_with_the_place_and_what_came_before_is_kept(
     ],
 )
 def test_code_that_cannot_be_imported_is_reported(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: str | None, reason: str
+    tmp_path: Path, code: str | None, reason: str
 ) -> None:
     if code is not None:
         (tmp_path / "my_device.py").write_text(code + "\n", encoding="utf-8")
-    monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "my_device", raising=False)
     with pytest.raises(HydraException) as caught:
         instantiate({"_target_": "my_device.RawImages"})
     reported = sentence(caught.value)
@@ -135,6 +133,5 @@ def test_a_device_without_frames_is_reported() -> None:
     class Empty(BaseDevice): ...
 
     with Empty(Camera(np.eye(3), 4, 3)) as device:
-        assert isinstance(device, Device)
         with pytest.raises(ToftrackError, match="Empty has no frames; write its method __iter__"):
             next(iter(device))

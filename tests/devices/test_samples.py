@@ -58,7 +58,6 @@ def test_a_sample_is_tracked(name: str, start: int, least: float, one_thread: No
 
 def test_sample_is_the_packaged_recording() -> None:
     device = Sample()
-    assert isinstance(device, BaseDevice)
     assert (device.frames, device.fps) == (100, 25)
     assert (device.camera.width, device.camera.height) == (176, 144)
     assert device.truth.joint_visible.shape == (100, 21)
@@ -97,12 +96,7 @@ def error_mm(device: BaseDevice) -> float:
     return float(errors_mm(estimates, sample()).mean())
 
 
-@pytest.fixture(scope="module")
-def straight_mm(one_thread: None) -> float:
-    return error_mm(Sample(stop=FRAMES))
-
-
-def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, straight_mm: float) -> None:
+def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, one_thread: None) -> None:
     pinhole = Sample().camera
     # Twice as many pixels, less those that a Kinect's narrow image has not.
     K = pinhole.K.copy()
@@ -115,4 +109,5 @@ def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, straight
     ]
     about = calibration(K, 512, (96, 90))
     path = write_kinect(tmp_path / "hand.mkv", np.stack(words), about=about)
+    straight_mm = error_mm(Sample(stop=FRAMES))
     assert error_mm(Replay(path)) == pytest.approx(straight_mm, abs=1.0)

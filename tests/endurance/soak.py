@@ -96,14 +96,12 @@ def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
     def median(samples: Sequence[Sample], name: str) -> float:
         return float(np.median([getattr(sample, name) for sample in samples]))
 
-    limits: dict[str, Callable[[float], float]] = {
-        "memory_mb": lambda before: before * (1 + _MOST_MEMORY),
-        "threads": lambda before: before + _MOST_COUNT,
-        "handles": lambda before: before + _MOST_COUNT,
+    limits = {
+        "memory_mb": median(first, "memory_mb") * (1 + _MOST_MEMORY),
+        "threads": median(first, "threads") + _MOST_COUNT,
+        "handles": median(first, "handles") + _MOST_COUNT,
     }
-    return [
-        name for name, limit in limits.items() if median(last, name) > limit(median(first, name))
-    ]
+    return [name for name, limit in limits.items() if median(last, name) > limit]
 
 
 def soak(

@@ -116,18 +116,9 @@ def _check(estimate: Estimate) -> None:
     assert 0 <= estimate.score <= 1
     for share in (estimate.confidence, estimate.side_probability, estimate.gesture_probability):
         assert np.isnan(share) or 0 <= share <= 1
-    for array in (
-        estimate.covariance,
-        estimate.joint_sigma_m,
-        estimate.joint_confidence,
-        estimate.pointing_origin_m,
-        estimate.pointing_direction,
-        estimate.landmarks,
-        estimate.openxr_position_m,
-        estimate.openxr_orientation,
-        estimate.openxr_radius_m,
-    ):
-        assert np.isfinite(array).all() or np.isnan(array).all()
+    for name, value in estimate.values().items():
+        if isinstance(value, np.ndarray):
+            assert np.isfinite(value).all() or np.isnan(value).all(), name
 
 
 def _follow(tracker: Tracker | HandsTracker, frames: list[tuple[tuple[Any, Any], Any]]) -> None:

@@ -6,7 +6,8 @@ import io
 import struct
 import tracemalloc
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -52,15 +53,21 @@ def save(path: Path, content: dict[str, bytes | list[bytes]], method: int) -> Pa
     return path
 
 
-def reported(path: Path) -> str:
-    """What is said, after little memory was used; tracemalloc sees what Python allocates."""
+@contextmanager
+def little_memory() -> Iterator[None]:
+    """tracemalloc sees what Python allocates."""
     tracemalloc.start()
     try:
-        with pytest.raises(ValueError) as error:
-            read_archive(path)
+        yield
         assert tracemalloc.get_traced_memory()[1] < 2**24
     finally:
         tracemalloc.stop()
+
+
+def reported(path: Path) -> str:
+    """What is said, after little memory was used."""
+    with little_memory(), pytest.raises(ValueError) as error:
+        read_archive(path)
     return str(error.value)
 
 
@@ -107,10 +114,8 @@ def test_more_than_the_directory_states_is_not_unpacked(tmp_path: Path) -> None:
     bomb = with_more_than_stated(tmp_path / "deflated.npz", DEFLATED)
     assert "'a' is damaged: Bad CRC-32" in reported(bomb)
     bomb = with_more_than_stated(tmp_path / "packed.npz", BZIP2)
-    tracemalloc.start()
-    assert read_archive(bomb)["a"].shape == (1000,)
-    assert tracemalloc.get_traced_memory()[1] < 2**24
-    tracemalloc.stop()
+    with little_memory():
+        assert read_archive(bomb)["a"].shape == (1000,)
 
 
 def test_what_is_written_is_what_numpy_reads(tmp_path: Path) -> None:
@@ -176,29 +181,14 @@ def test_an_array_beyond_the_cap_is_refused(
     monkeypatch.setattr(archives, "MOST_BYTES", 1000)
     path = save(tmp_path / "a.npz", {n: npy(np.ones(100)) for n in "ab"}, STORED)
     assert "it is larger than" in reported(path)
-    with open(path, "rb") as stream, pytest.raises(ValueError, match="at most"):
-        Archive(stream).read("a", 100)
+    monkeypatch.setattr(archives, "MOST_BYTES", 100)
+    with open(path, "rb") as stream, pytest.raises(ValueError, match="'a': it is larger than"):
+        Archive(stream).read("a")
 
 
 def test_other_compressions_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
     assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
-
-
-def test_what_is_much_larger_than_the_directory_says_is_not_unpacked(
-    tmp_path: Path,
-) -> None:
-    path = save(tmp_path / "a.npz", {"a": [header((2**26,), "<u1"), *[ZEROS] * 64]}, BZIP2)
-    whole = path.read_bytes()
-    size = struct.pack("<I", 2**26 + len(header((2**26,), "<u1")))
-    assert size in whole
-    small = npy(np.zeros(1000, np.uint8))
-    path.write_bytes(whole.replace(size, struct.pack("<I", len(small))))
-    tracemalloc.start()
-    with pytest.raises(ValueError, match="'a': it is of another length"):
-        read_archive(path)
-    assert tracemalloc.get_traced_memory()[1] < 1e7
-    tracemalloc.stop()
 
 
 @every_method

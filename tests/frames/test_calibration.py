@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
-from functools import lru_cache
+from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -31,50 +31,44 @@ def wiggle(radial_m: np.ndarray) -> np.ndarray:
     return 0.003 * np.sin(2 * np.pi * radial_m / 1.874 + 0.6) + 0.010 * radial_m
 
 
-def no_error(radial_m: np.ndarray) -> np.ndarray:
-    return np.zeros_like(radial_m)
+BOARD, SQUARE_M = (7, 5), 0.03
+"""Columns and rows of inner corners."""
+# The nominal camera, off by 5 %, and a barrel distortion.
+TRUE = Camera(np.array([[210.0, 0, 96.6], [0, 210.0, 63], [0, 0, 1]]), 176, 144, [-0.2, 0, 0, 0, 0])
 
 
-def board_poses(
-    count: int, near_m: float, far_m: float, size_m: tuple[float, float], seed: int = 0
-) -> list[tuple[np.ndarray, np.ndarray]]:
+def board_poses(count: int, near_m: float, far_m: float) -> list[tuple[np.ndarray, np.ndarray]]:
     """Rotations (3, 3) and translations (3,) of boards that are mostly in view, turned by up to 40
     degrees, from near to far; the board's middle is its origin."""
-    rng = np.random.default_rng(seed)
-    poses = []
+    rng, poses = np.random.default_rng(0), []
+    half_m = (np.array(BOARD) + 2) * SQUARE_M / 2
     for z in near_m * (far_m / near_m) ** np.linspace(0, 1, count):
         turn = rng.uniform(-0.7, 0.7, 3) * (1, 1, 0.3)
-        free_x = max(0.0, 0.40 * z - 0.5 * size_m[0])
-        free_y = max(0.0, 0.30 * z - 0.5 * size_m[1])
-        middle = np.array([rng.uniform(-free_x, free_x), rng.uniform(-free_y, free_y), z])
+        free = np.maximum(0.0, np.multiply((0.40, 0.30), z) - half_m)
+        middle = np.append(rng.uniform(-free, free), z)
         poses.append((cv2.Rodrigues(turn)[0], middle))
     return poses
 
 
 def render_board(
-    camera: Camera,
-    board: tuple[int, int],
-    square_m: float,
-    pose: tuple[np.ndarray, np.ndarray],
-    rng: np.random.Generator | None = None,
-    error: Callable[[np.ndarray], np.ndarray] = no_error,
+    pose: tuple[np.ndarray, np.ndarray], rng: np.random.Generator | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The radial distance, (H, W) float32 m, and the amplitude, uint16, of one board.
+    """The radial distance, (H, W) float32 m, and the amplitude, uint16, of one board, by TRUE.
 
-    The board has `board` = columns, rows of inner corners and a white margin of one square, before
-    a grey wall. Each pixel sums the phasors of 3 x 3 samples, so that edges mix as in the camera.
-    With `rng`: noise as of the mesh-hand recordings, 3.5 mm at an amplitude of 2560.
+    The board has a white margin of one square, before a grey wall. Each pixel sums the phasors of
+    3 x 3 samples, so that edges mix as in the camera. With `rng`: the depth error, and noise as of
+    the mesh-hand recordings, 3.5 mm at an amplitude of 2560.
     """
     rotation, middle = pose
-    rays = _sample_rays(camera)
+    rays = _sample_rays()
     lengths = np.sqrt(1 + (rays**2).sum(-1))
     directions = np.concatenate([rays, np.ones_like(rays[..., :1])], -1)
     z = (middle @ rotation[:, 2]) / (directions @ rotation[:, 2])
     on_board = (directions * z[..., None] - middle) @ rotation  # (..., 3), the third is 0
-    across = on_board[..., 0] / square_m + (board[0] - 1) / 2
-    down = on_board[..., 1] / square_m + (board[1] - 1) / 2
-    squares = (across > -1) & (across < board[0]) & (down > -1) & (down < board[1])
-    margin = (across > -2) & (across < board[0] + 1) & (down > -2) & (down < board[1] + 1)
+    across = on_board[..., 0] / SQUARE_M + (BOARD[0] - 1) / 2
+    down = on_board[..., 1] / SQUARE_M + (BOARD[1] - 1) / 2
+    squares = (across > -1) & (across < BOARD[0]) & (down > -1) & (down < BOARD[1])
+    margin = (across > -2) & (across < BOARD[0] + 1) & (down > -2) & (down < BOARD[1] + 1)
     black = squares & ((np.floor(across) + np.floor(down)) % 2 == 0)
     seen = margin & (z > 0)
     z = np.where(seen, z, _WALL_M)
@@ -89,35 +83,25 @@ def render_board(
             rng.standard_normal(phasors.shape) + 1j * rng.standard_normal(phasors.shape)
         )
     measured = np.angle(phasors) % (2 * np.pi) * RANGE_M / (2 * np.pi)
-    measured = measured + error(measured)
+    if rng is not None:
+        measured = measured + wiggle(measured)
     strength = np.clip(np.abs(phasors), 0, 65535).astype(np.uint16)
     return measured.astype(np.float32), strength
 
 
-@lru_cache(maxsize=2)
-def _sample_rays(camera: Camera) -> np.ndarray:
+@cache
+def _sample_rays() -> np.ndarray:
     """(H, W, S, S, 2) x and y at Z = 1 of the samples of each pixel."""
     steps = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
     v, u, dv, du = np.meshgrid(
-        np.arange(camera.height), np.arange(camera.width), steps, steps, indexing="ij"
+        np.arange(TRUE.height), np.arange(TRUE.width), steps, steps, indexing="ij"
     )
-    focal, centre = camera.K[[0, 1], [0, 1]], camera.K[:2, 2]
-    distorted = (np.stack([u + du, v + dv], -1) - centre) / focal
-    k1, k2, p1, p2, k3 = camera.distortion
-    rays = distorted
-    for _ in range(15):  # a fixed point: the distortion is mild
-        x, y = rays[..., 0], rays[..., 1]
-        r2 = x * x + y * y
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        shift_x = 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-        shift_y = p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-        rays = (distorted - np.stack([shift_x, shift_y], -1)) / radial[..., None]
+    focal, centre = TRUE.K[[0, 1], [0, 1]], TRUE.K[:2, 2]
+    rays = distorted = (np.stack([u + du, v + dv], -1) - centre) / focal
+    for _ in range(15):  # a fixed point: the distortion is mild, and only of the first order
+        radial = 1 + TRUE.distortion[0] * (rays**2).sum(-1)
+        rays = distorted / radial[..., None]
     return rays
-
-
-BOARD, SQUARE_M = (7, 5), 0.03
-# The nominal camera, off by 5 %, and a barrel distortion.
-TRUE = Camera(np.array([[210.0, 0, 96.6], [0, 210.0, 63], [0, 0, 1]]), 176, 144, [-0.2, 0, 0, 0, 0])
 
 
 @pytest.fixture(scope="module")
@@ -125,8 +109,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A board from 0.33 to 1.5 m, with noise and a depth error; nothing is said of the camera."""
     path, rng = tmp_path_factory.mktemp("calibration") / "board.srs", np.random.default_rng(0)
     with SrsWriter(path, facts=SrsFacts(RANGE_M)) as writer:
-        for number, pose in enumerate(board_poses(24, 0.33, 1.5, (0.27, 0.21))):
-            images = render_board(TRUE, BOARD, SQUARE_M, pose, rng, wiggle)
+        for number, pose in enumerate(board_poses(24, 0.33, 1.5)):
+            images = render_board(pose, rng)
             writer.append(encode_frame(*images, RANGE_M), number / 25)
     return path
 
@@ -143,24 +127,14 @@ def calibrated(recording: Path) -> tuple[Camera, Path]:
     return Camera.load(out), report
 
 
-def parallel(width: int, **depth: object) -> Camera:
-    """A camera whose first row's rays hardly part: radial distance and Z are the same."""
-    return Camera(np.diag((1e5, 1e5, 1)), width, 2000, **depth)
-
-
-def rectified(camera: Camera, radial_m: np.ndarray) -> np.ndarray:
-    return camera.rectify(np.tile(radial_m.astype(np.float32), (2000, 1)), True)[0]
-
-
 def depth_error_m(camera: Camera) -> np.ndarray:
     """What is left of the depth error from 0.3 to 1.5 m."""
     true = np.linspace(0.3, 1.5, 500)
-    flat = parallel(
-        500,
-        depth_polynomial=camera.depth_polynomial,
-        depth_polynomial_range_m=camera.depth_polynomial_range_m,
-    )
-    return rectified(flat, true + wiggle(true)) - true
+    # The rays of its first row hardly part: radial distance and Z are the same.
+    K = np.diag((1e5, 1e5, 1))
+    flat = replace(camera, K=K, width=500, height=2000, distortion=np.zeros(5))
+    measured = np.tile((true + wiggle(true)).astype(np.float32), (2000, 1))
+    return flat.rectify(measured, True)[0] - true
 
 
 def test_finds_the_lens_again(calibrated: tuple[Camera, Path]) -> None:
@@ -208,27 +182,20 @@ def test_a_known_lens_is_kept(recording: Path, tmp_path: Path) -> None:
     assert (tmp_path / "camera.report" / "report.txt").exists()
 
 
-def exact_views(camera: Camera, count: int = 12) -> list[View]:
-    points, views = calibration.board_points(BOARD, SQUARE_M), []
-    middle = points.mean(0)
-    for index, (rotation, place) in enumerate(board_poses(count, 0.35, 1.2, (0.27, 0.21))):
-        origin = place - rotation @ middle
-        pixels, _ = cv2.projectPoints(
-            points, cv2.Rodrigues(rotation)[0], origin, camera.K, camera.distortion
-        )
-        views.append(View(index, pixels.reshape(-1, 2)))
-    return views
-
-
 def test_exact_corners_give_the_exact_lens_and_planes() -> None:
-    views = exact_views(TRUE)
+    points, views = calibration.board_points(BOARD, SQUARE_M), []
+    poses = board_poses(12, 0.35, 1.2)
+    for index, (rotation, middle) in enumerate(poses):
+        origin, turn = middle - rotation @ points.mean(0), cv2.Rodrigues(rotation)[0]
+        pixels, _ = cv2.projectPoints(points, turn, origin, TRUE.K, TRUE.distortion)
+        views.append(View(index, pixels.reshape(-1, 2)))
     lens = calibration.fit_lens(views, BOARD, SQUARE_M, nominal_camera())
     np.testing.assert_allclose(lens.camera.K, TRUE.K, atol=0.01)
     known = calibration.known_lens(views, BOARD, SQUARE_M, TRUE)
     assert known.errors_px.max() < 1e-3
-    for number, pose in enumerate(board_poses(12, 0.35, 1.2, (0.27, 0.21))):
+    for number, pose in enumerate(poses):
         distance = calibration.true_distances(known, number, BOARD, SQUARE_M)
-        radial, _ = render_board(TRUE, BOARD, SQUARE_M, pose)
+        radial, _ = render_board(pose)
         on_board = np.isfinite(distance)
         assert on_board.sum() > 300
         # Rendered from samples within each pixel; slanted pixels differ a little.

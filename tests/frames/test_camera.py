@@ -178,20 +178,17 @@ def test_files_that_are_no_camera_are_reported(tmp_path: Path) -> None:
         Camera(K, W, H).save(tmp_path / "nowhere" / "camera.json")
 
 
-PLAUSIBLE = np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]])
-
-
 @pytest.mark.parametrize(
     ("place", "value"),
     [((0, 0), 1e-300), ((1, 1), 1e300), ((0, 2), 5000.0), ((1, 2), -900.0)],
 )
 def test_a_matrix_that_no_camera_has_is_refused_with_one_that_is_plausible(place, value) -> None:
-    K = PLAUSIBLE.copy()
-    K[place] = value
-    with pytest.raises(ToftrackError, match=r"a plausible one is \[\[194, 0, 88\]"):
-        Camera(K, 176, 144)
-    with pytest.raises(ToftrackError, match="of 176x144 pixels"):
-        Camera(np.eye(3), 176, 144)
+    strange = K.copy()
+    strange[place] = value
+    words = r"of 176x144 pixels .*; a plausible one is \[\[194, 0, 88\]"
+    for matrix in (strange, np.eye(3)):
+        with pytest.raises(ToftrackError, match=words):
+            Camera(matrix, W, H)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,6 @@ import re
 import shutil
 import threading
 import time
-from collections import namedtuple
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -204,22 +203,19 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
     assert (tmp_path / "hand.npz.part").is_symlink()
 
 
-def test_at_its_limit_it_ends_as_a_whole_file(tmp_path: Path) -> None:
-    recorder = recorded(tmp_path / "hand.npz", limit_gb=8e-6)
-    assert 1 < recorder.frames < FRAMES and not recorder.failed
-    assert "8e-06 GB, its limit" in (recorder.ended or "")
-    assert len(read_recording(tmp_path / "hand.npz")) == recorder.frames
-
-
-def test_before_the_disk_is_full_it_ends_as_a_whole_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("limit_gb", "free", "why"),
+    [(8e-6, 10**12, "8e-06 GB, its limit"), (1.0, 6000, "the disk is nearly full")],
+)
+def test_at_its_limit_and_before_the_disk_is_full_it_ends_as_a_whole_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit_gb: float, free: int, why: str
 ) -> None:
-    usage = namedtuple("usage", "free")(module._SPARE_BYTES + 6000)
+    usage = SimpleNamespace(free=module._SPARE_BYTES + free)
     fake = SimpleNamespace(disk_usage=lambda path: usage)
     monkeypatch.setattr("toftrack.recordings.unfinished.shutil", fake)
-    recorder = recorded(tmp_path / "hand.npz")
-    assert 1 <= recorder.frames < FRAMES
-    assert "the disk is nearly full" in (recorder.ended or "")
+    recorder = recorded(tmp_path / "hand.npz", limit_gb=limit_gb)
+    assert 1 <= recorder.frames < FRAMES and not recorder.failed
+    assert why in (recorder.ended or "")
     assert len(read_recording(tmp_path / "hand.npz")) == recorder.frames
 
 
@@ -228,24 +224,13 @@ def test_on_a_full_disk_the_frames_until_then_are_kept(tmp_path: Path, files_of_
         recorder = recorded(tmp_path / "hand.npz")
     count, ended = recorder.frames, recorder.ended or ""
     assert recorder.failed and 1 < count < FRAMES
-    assert "make room, then `toftrack recover" in ended and "\n" not in ended
+    assert "which is kept (" in ended and "\n" not in ended
+    assert "make room, then `toftrack recover" in ended
+    assert [file.name for file in tmp_path.iterdir()] == ["hand.npz.part"]
     recording = read_recording(recover_recording(tmp_path / "hand.npz")[0])
     assert len(recording) == count
     for number, frame in zip(range(count), Images(), strict=False):
         assert recording.image(number)[0].tobytes() == frame.depth.tobytes()
-
-
-def test_what_cannot_be_finished_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*arguments: object, **others: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr("toftrack.recordings.unfinished._make_npz", full)
-        recorder = recorded(tmp_path / "hand.npz")
-    assert recorder.failed
-    assert "which is kept (No space left on device); make room" in (recorder.ended or "")
-    assert [file.name for file in tmp_path.iterdir()] == ["hand.npz.part"]
-    assert recover_recording(tmp_path / "hand.npz")[1] == FRAMES
 
 
 @pytest.mark.parametrize(

@@ -192,10 +192,3 @@ def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
         radial = truth.depth[index % 100].astype(np.float32) * lengths
         expected = encode_frame(radial, truth.amplitude[index % 100], RANGE_M)
         assert recording.raw(index) == expected
-
-
-@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_link_to_a_device_is_not_written(tmp_path: Path) -> None:
-    (tmp_path / "full.srs").symlink_to("/dev/full")
-    with pytest.raises(ToftrackError, match="symbolic link"):
-        SrsWriter(tmp_path / "full.srs", overwrite=True)

@@ -1,4 +1,4 @@
-"""Stacks in one file, TIFF, HDF5 and MATLAB's: what comes out, what is chosen, what is refused."""
+"""Stacks in one file: what comes out, what is chosen, what is refused."""
 
 from __future__ import annotations
 
@@ -43,6 +43,11 @@ def hdf5(path: Path, **arrays: Any) -> Path:
     return path
 
 
+def npy(path: Path, images: np.ndarray) -> Path:
+    np.save(path, images)
+    return path
+
+
 def tiff(path: Path, images: np.ndarray) -> Path:
     cv2.imwritemulti(str(path), list(images))
     return path
@@ -63,6 +68,8 @@ def matlab_7_3(path: Path, images: np.ndarray) -> Path:
 
 MATLABS = METRES.transpose(1, 2, 0)
 KINDS: dict[str, Callable[[Path], Path]] = {
+    "whole .npy": lambda at: npy(at / "a.npy", WORDS.astype(np.int32)),
+    "float .npy": lambda at: npy(at / "a.npy", METRES.astype(np.float64)),
     "16-bit TIFF": lambda at: tiff(at / "a.tif", WORDS),
     "float TIFF": lambda at: tiff(at / "a.TIFF", METRES),
     "HDF5": lambda at: hdf5(at / "a.h5", depth=WORDS),
@@ -106,8 +113,7 @@ def test_what_is_damaged_or_cut_off_is_read_or_told(tmp_path: Path, kind: str) -
 
 def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
     """Where it was mapped into memory the system would end the process."""
-    path = tmp_path / "a.npy"
-    np.save(path, WORDS)
+    path = npy(tmp_path / "a.npy", WORDS)
     store = opened(path)
     os.truncate(path, path.stat().st_size - HEIGHT * WIDTH * 2)
     np.testing.assert_allclose(store.image(3)[0], METRES[3], atol=1e-6)
@@ -118,11 +124,42 @@ def test_a_npy_that_shrinks_while_it_is_read_is_told(tmp_path: Path) -> None:
 def test_a_npy_in_fortran_order_is_loaded_where_it_is_not_too_large(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    np.save(tmp_path / "a.npy", np.asfortranarray(WORDS))
-    np.testing.assert_allclose(opened(tmp_path / "a.npy").image(3)[0], METRES[3], atol=1e-6)
+    path = npy(tmp_path / "a.npy", np.asfortranarray(WORDS))
+    np.testing.assert_allclose(opened(path).image(3)[0], METRES[3], atol=1e-6)
     monkeypatch.setattr(stacks, "MOST_BYTES", WORDS.nbytes - 1)
     with pytest.raises(ToftrackError, match="numpy.ascontiguousarray"):
+        opened(path)
+
+
+def test_a_single_image_is_a_stack_of_one(tmp_path: Path) -> None:
+    store = opened(npy(tmp_path / "a.npy", WORDS[0]))
+    assert len(store) == 1
+    np.testing.assert_allclose(store.image(0)[0], METRES[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("stack", "words"),
+    [
+        (np.ones((2, 3, 4, 3)), "must be depth images"),
+        (np.full((2, 24, 32), 900.0), "plainly another unit.*--source-unit"),
+        (np.array([[None] * 4] * 3), "Python objects"),
+    ],
+)
+def test_a_npy_of_another_kind_is_reported(tmp_path: Path, stack: np.ndarray, words: str) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        opened(npy(tmp_path / "a.npy", stack))
+
+
+@pytest.mark.parametrize(
+    "shape", ["(-1, 24, 32)}", "(3, 24, 32, }", "(3, 24, 32)}" + 10_000 * " ", f"({30 * '9'},)}}"]
+)
+def test_a_npy_whose_header_lies_is_reported(tmp_path: Path, shape: str) -> None:
+    text = f"{{'descr': '<u2', 'fortran_order': False, 'shape': {shape}\n".encode()
+    header = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
+    (tmp_path / "a.npy").write_bytes(header + bytes(4608))
+    with pytest.raises(ToftrackError, match="a.npy' cannot be read") as caught:
         opened(tmp_path / "a.npy")
+    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])

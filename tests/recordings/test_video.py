@@ -1,8 +1,7 @@
-"""Azure Kinect's recordings, grey videos and .npy stacks give what went in; others are told."""
+"""Azure Kinect's recordings and grey videos give what went in; others are told."""
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -74,17 +73,13 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
     assert (camera.width, camera.height) == size
 
 
-@pytest.mark.parametrize("share", [0.001, 0.5, 0.95])
-def test_a_kinects_recording_that_was_cut_off_is_used_so_far_or_reported(
+@pytest.mark.parametrize("share", [0.5, 0.95])
+def test_a_kinects_recording_that_was_cut_off_is_used_so_far(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
 ) -> None:
     depth = np.concatenate([images[0]] * 3)
     path = write_kinect(tmp_path / "cut.mkv", depth, about=ABOUT)
     path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
-    if share < 0.05:
-        with pytest.raises(ToftrackError, match="cut.mkv.*(cannot be read|no frame of depth)"):
-            Replay(path)
-        return
     store = open_recording(path)
     assert store.damage or share > 0.9, "a frame or two at the end may be missing anyway"
     frames = list(Replay(path))
@@ -117,13 +112,9 @@ def test_a_calibration_that_tells_no_lens_is_reported(
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 252
 
 
-# Videos and stacks that say nothing of themselves.
-
-
 @pytest.mark.parametrize(
     ("name", "codec", "pixels"),
     [
-        ("a.mkv", "ffv1", "gray16le"),
         ("a.avi", "ffv1", "gray16le"),
         ("a.mov", "png", "gray16be"),
         ("a.nut", "rawvideo", "gray16le"),
@@ -168,53 +159,3 @@ def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
     (tmp_path / "b.mp4").write_bytes(b"nonsense" * 99)
     with pytest.raises(ToftrackError, match="b.mp4' cannot be read as a video"):
         Replay(tmp_path / "b.mp4")
-
-
-@pytest.mark.parametrize(
-    ("stack", "factor"),
-    [
-        (words().astype(np.int32) // 8, 0.001),
-        (words()[0] // 8, 0.001),
-        (words() / 5000, 1),
-    ],
-)
-def test_stacks_are_depth(tmp_path: Path, stack: np.ndarray, factor: float) -> None:
-    np.save(tmp_path / "a.npy", stack)
-    store = open_recording(tmp_path / "a.npy", bare=REPORTED)
-    images = stack.reshape(-1, 24, 32)
-    assert len(store) == len(images)
-    np.testing.assert_allclose(store.image(len(images) - 1)[0], images[-1] * factor, rtol=1e-6)
-    assert store.image(0)[0].dtype == np.float32
-
-
-@pytest.mark.parametrize(
-    ("stack", "complaint"),
-    [
-        (np.ones((2, 3, 4, 3)), "must be depth images"),
-        (np.full((2, 24, 32), 900.0), "plainly another unit.*--source-unit"),
-        (np.array([[None] * 4] * 3), "Python objects"),
-    ],
-)
-def test_stacks_of_another_kind_are_reported(
-    tmp_path: Path, stack: np.ndarray, complaint: str
-) -> None:
-    np.save(tmp_path / "a.npy", stack, allow_pickle=True)
-    with pytest.raises(ToftrackError, match=complaint):
-        open_recording(tmp_path / "a.npy", bare=REPORTED)
-
-
-def stack_with_header(shape: str) -> bytes:
-    text = f"{{'descr': '<u2', 'fortran_order': False, 'shape': {shape}".encode() + b"\n"
-    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + bytes(4608)
-
-
-def test_damaged_stacks_are_reported(tmp_path: Path) -> None:
-    np.save(tmp_path / "a.npy", words())
-    content = (tmp_path / "a.npy").read_bytes()
-    parts = [b"", content[:7], content[:50], content[:-9], b"nonsense" * 30]
-    shapes = ("(-1, 24, 32)}", "(3, 24, 32, }", "(3, 24, 32)}" + 10_000 * " ", f"({30 * '9'},)}}")
-    for part in (*parts, *map(stack_with_header, shapes)):
-        (tmp_path / "a.npy").write_bytes(part)
-        with pytest.raises(ToftrackError, match="a.npy' cannot be read") as caught:
-            open_recording(tmp_path / "a.npy", bare=REPORTED)
-        assert "\n" not in str(caught.value)

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from toftrack.devices.base import BaseDevice
+from toftrack.devices.base import BaseDevice, check_keep
 from toftrack.devices.seen import cameras_seen
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_number, reported_errors
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 
@@ -125,19 +125,12 @@ class SdkCamera(BaseDevice):
         timeout_s: float,
     ) -> None:
         """Check the settings that all such cameras have; raises ToftrackError."""
-        numbers = isinstance(queue_frames, int) and isinstance(timeout_s, int | float)
-        sensible = numbers and queue_frames >= 2 and timeout_s > 0
-        if keep not in ("newest", "every") or not sensible:
-            raise ToftrackError(
-                f"device={self.kind} needs keep=newest or every, queue_frames of at least 2 and "
-                f"timeout_s above 0, but they are {keep}, {queue_frames!r} and {timeout_s!r}"
-            )
-        whole = all(isinstance(number, int) for number in (start, stop) if number is not None)
-        if not whole or start < 0 or (stop is not None and stop <= start):
-            raise ToftrackError(
-                f"device={self.kind} needs whole numbers 0 <= start < stop, but they are "
-                f"{start!r} and {stop!r}"
-            )
+        check_keep(keep)
+        check_number("device.queue_frames", queue_frames, 2, whole=True)
+        check_number("device.timeout_s", timeout_s, 0, above=True)
+        check_number("device.start", start, 0, whole=True)
+        if stop is not None:
+            check_number("device.stop", stop, start + 1, whole=True)
         self._path = None if bag is None else Path(bag).expanduser()
         if self._path is not None and not self._path.is_file():
             raise ToftrackError(f"there is no file '{bag}'; give a recording with device.bag=FILE")

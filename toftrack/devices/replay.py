@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.devices.base import BaseDevice
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
@@ -78,7 +78,10 @@ class Replay(BaseDevice):
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
         if store.left_out:
             _log.warning("%s: %s", path, store.left_out)
-        self._range = _checked_range(start, stop, len(store), path)
+        self._range = rows = _checked_range(start, stop, len(store), path)
+        self._times_s = store.timestamp_s[rows.start : rows.stop]
+        self._round_s = float(self._times_s[-1] - self._times_s[0]) + 1 / store.fps
+        """From a frame to the same one in the next round; the last one lasts one frame's time."""
         self._realtime, self._repeat = bool(realtime), bool(repeat)
         if intrinsics is not None and camera_file is not None:
             raise ToftrackError(
@@ -96,16 +99,16 @@ class Replay(BaseDevice):
         super().__init__(
             camera,
             store.fps,
-            frames=None if self._repeat else len(self._range),
-            truth=None if truth is None else truth[self._range.start : self._range.stop],
+            frames=None if self._repeat else len(rows),
+            truth=None if truth is None else truth[rows.start : rows.stop],
             live=self._realtime,
         )
         self.metadata = store.metadata
         self.description: dict[str, Any] = {
             "device": "replay",
             "recording": str(path),
-            "start": self._range.start,
-            "stop": self._range.stop,
+            "start": rows.start,
+            "stop": rows.stop,
             "realtime": self._realtime,
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
@@ -140,22 +143,14 @@ class Replay(BaseDevice):
 
     def _due(self, elapsed_s: float) -> int:
         """The count of the newest frame that is due so long after the first one."""
-        times_s = self._times_s()
-        rounds, within_s = divmod(elapsed_s, self._round_s()) if self._repeat else (0, elapsed_s)
+        times_s = self._times_s
+        rounds, within_s = divmod(elapsed_s, self._round_s) if self._repeat else (0, elapsed_s)
         row = int(np.searchsorted(times_s, times_s[0] + within_s, side="right")) - 1
         return int(rounds) * len(times_s) + row
 
     def _time_s(self, count: int) -> float:
         rounds, row = divmod(count, len(self._range))
-        return float(self._times_s()[row]) + (rounds * self._round_s() if rounds else 0.0)
-
-    def _round_s(self) -> float:
-        """From a frame to the same one in the next round; the last one lasts one frame's time."""
-        times_s = self._times_s()
-        return float(times_s[-1] - times_s[0]) + 1 / self.fps
-
-    def _times_s(self) -> np.ndarray:
-        return self._recording.timestamp_s[self._range.start : self._range.stop]
+        return float(self._times_s[row]) + rounds * self._round_s
 
     def _frame(self, count: int) -> Frame:
         recording = self._recording
@@ -221,13 +216,9 @@ class Sample(Replay):
 
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:
-    for name, value in (("start", start), ("stop", stop)):
-        whole = isinstance(value, (int, np.integer)) and not isinstance(value, bool)
-        if not whole and not (name == "stop" and value is None):
-            raise ToftrackError(
-                f"{name}={value!r} is not a frame number; give a whole number from 0 to {count}"
-            )
     stop = count if stop is None else stop
+    check_number("start", start, whole=True)
+    check_number("stop", stop, whole=True)
     if not 0 <= start < stop <= count:
         raise ToftrackError(
             f"the frames from start={start} to stop={stop} do not lie in '{path}', which has "

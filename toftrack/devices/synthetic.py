@@ -14,7 +14,7 @@ import torch
 
 from toftrack.compute.threads import small_operations
 from toftrack.devices.base import BaseDevice
-from toftrack.errors import ToftrackError
+from toftrack.errors import check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame, Truth
 from toftrack.hand.shape import default_hand_shape
@@ -43,10 +43,9 @@ class Synthetic(BaseDevice):
         seed: int = 0,
         camera_file: str | None = None,
     ) -> None:
-        if frames < 1 or fps <= 0 or noise_m < 0:
-            raise ToftrackError(
-                "device=synthetic needs frames of at least 1, fps above 0 and noise_m not below 0"
-            )
+        check_number("device.frames", frames, 1, whole=True)
+        check_number("device.fps", fps, 0, above=True)
+        check_number("device.noise_m", noise_m, 0)
         camera = (
             Camera.load(camera_file)
             if camera_file

@@ -94,14 +94,16 @@ class Archive:
         """Of all arrays."""
         return tuple(self._entries)
 
-    def header(self, name: str, most_bytes: int | None = MOST_BYTES) -> Header:
-        """An array's header; most_bytes: larger arrays are refused, None: none is."""
-        with self._opened(name, most_bytes) as (_, header):
+    def header(self, name: str) -> Header:
+        """An array's header, however large the array is."""
+        with self._opened(name) as (_, header):
             return header
 
-    def read(self, name: str, most_bytes: int = MOST_BYTES) -> np.ndarray:
-        """An array as a whole."""
-        with self._opened(name, most_bytes) as (stream, header):
+    def read(self, name: str) -> np.ndarray:
+        """An array as a whole; of more than a gigabyte it is refused."""
+        with self._opened(name) as (stream, header):
+            if header.size > MOST_BYTES:
+                raise ValueError(f"it is larger than {MOST_BYTES / 1e9:.1f} GB")
             content = bytearray()
             while piece := stream.read(min(_PIECE_BYTES, header.size - len(content))):
                 content += piece
@@ -115,14 +117,14 @@ class Archive:
     @contextmanager
     def rows(self, name: str) -> Iterator[IO[bytes]]:
         """The bytes of an array, after its header, to be read in turn."""
-        with self._opened(name, None) as (stream, _):
+        with self._opened(name) as (stream, _):
             yield stream
 
     def close(self) -> None:
         self._zip.close()
 
     @contextmanager
-    def _opened(self, name: str, most_bytes: int | None) -> Iterator[tuple[IO[bytes], Header]]:
+    def _opened(self, name: str) -> Iterator[tuple[IO[bytes], Header]]:
         """The bytes of an array after its header, and that."""
         entry = self._entries[name]
         with broken_is_value_error(name):
@@ -132,7 +134,7 @@ class Archive:
                 packed = entry.compress_type == zipfile.ZIP_BZIP2
                 stream = bz2.BZ2File(_Packed(self._stream, entry)) if packed else plain
                 header = _header(stream)
-                _check(header, entry, most_bytes)
+                _check(header, entry)
                 yield stream, header
 
 
@@ -248,13 +250,9 @@ def _header(stream: IO[bytes]) -> Header:
     return Header(shape, kind, fortran_order, 8 + len(counted) + length)
 
 
-def _check(header: Header, entry: zipfile.ZipInfo, most_bytes: int | None) -> None:
+def _check(header: Header, entry: zipfile.ZipInfo) -> None:
     if min(header.shape, default=0) < 0 or header.offset + header.size != entry.file_size:
         raise ValueError("it is of another length than its header says")
-    if most_bytes is not None and header.size > most_bytes:
-        raise ValueError(
-            f"it has {header.size / 1e9:.2g} GB, and at most {most_bytes / 1e9:.2g} are read"
-        )
     if header.kind.kind in "US" and header.size > MOST_TEXT_BYTES:
         raise ValueError(f"it is a text of {header.size / 1e6:.0f} MB")
     if entry.file_size > max(_SMALL_BYTES, _MOST_RATIO * entry.compress_size):

@@ -77,7 +77,6 @@ def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
     )
 
 
-# Compared by identity: the fields are arrays, and the tables below are cached per object.
 def largest_reading(depth: np.ndarray) -> float:
     """The largest of float32 readings (H, W); inf where one is negative, infinite or no number.
 
@@ -87,6 +86,7 @@ def largest_reading(depth: np.ndarray) -> float:
     return float(bits.view(np.float32)) if bits < _INFINITY else math.inf
 
 
+# Compared by identity: the fields are arrays, and the tables below are cached per object.
 @fields_in_help
 @dataclass(frozen=True, eq=False)
 class Camera:

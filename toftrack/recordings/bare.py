@@ -9,11 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import LARGEST_MEDIAN_M, median_reading
 
 MILLIMETRE = 0.001
+MOST = 1e6
+"""Of a unit or a rate."""
 _BESIDE = "camera.json"
 
 
@@ -31,9 +33,8 @@ class BareFacts:
 
     def __post_init__(self) -> None:
         for name in ("unit_m", "fps"):
-            value = getattr(self, name)
-            if value is not None and not is_positive(value):
-                raise ToftrackError(f"{name} must be a positive number, but is {value!r}")
+            if (value := getattr(self, name)) is not None:
+                check_number(name, value, 0, MOST, above=True)
         if self.intrinsics is not None and not _four_numbers(self.intrinsics):
             raise ToftrackError(
                 "intrinsics must be four numbers of pixels, fx, fy (above 0), cx, cy, as "
@@ -46,11 +47,6 @@ class BareFacts:
             return None
         fx, fy, cx, cy = self.intrinsics
         return Camera(np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), width, height)
-
-
-def is_positive(value: object) -> bool:
-    """Whether it is a number above 0 that may be a unit or a rate."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and 0 < value < 1e6
 
 
 def _four_numbers(values: object) -> bool:
@@ -69,14 +65,12 @@ def bare_camera(
     """The camera of a file of bare images of that size: as given, else camera.json beside it;
     ToftrackError where there is none, or it is of another size.
     """
-    if camera_file is not None:
-        return Camera.load_for(camera_file, width, height, f"'{path}'")
-    given = bare.camera(width, height)
-    if given is not None:
+    if camera_file is None and (given := bare.camera(width, height)):
         return given
     beside = path.parent / _BESIDE
-    if beside.exists():
-        return Camera.load_for(beside, width, height, f"'{path}'")
+    if camera_file is not None or beside.exists():
+        file = beside if camera_file is None else camera_file
+        return Camera.load_for(file, width, height, f"'{path}'")
     raise ToftrackError(
         f"'{path}' ({width}x{height} pixels) does not say what camera made it; give the lens with "
         "device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY), or a camera "

@@ -57,7 +57,10 @@ def doubts(store: FrameStore, camera: Camera) -> tuple[str, ...]:
 
 def _images_doubt(store: FrameStore) -> str:
     depth = getattr(store, "depth", None)
-    some = _first_image(store) if depth is None else some_images(depth)
+    try:
+        some = store.image(0)[0] if depth is None else some_images(depth)
+    except ToftrackError:  # told when its turn comes
+        return ""
     readings = some[(some > 0) & (some < np.inf)]
     if not readings.size:
         if depth is None:  # a camera's first image may be empty
@@ -66,13 +69,6 @@ def _images_doubt(store: FrameStore) -> str:
     if readings.size > 1 and readings.min() == readings.max():
         return f"every reading is {readings[0]:g} m, which no camera measures; was it saved whole?"
     return _unit_doubt(some, store.unit_m)
-
-
-def _first_image(store: FrameStore) -> np.ndarray:
-    try:
-        return store.image(0)[0]
-    except ToftrackError:  # told when its turn comes
-        return np.zeros((1, 1), np.float32)
 
 
 def _unit_doubt(depth_m: np.ndarray, unit_m: float | None) -> str:
@@ -103,8 +99,6 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
         return ""
     remedy = "or leave them out and give the frame rate (fps)"
     standing = int(np.count_nonzero(steps <= 0))
-    if standing == steps.size:
-        return f"all time stamps are {timestamp_s[0]:g}; give the seconds of each frame, {remedy}"
     if standing > steps.size / 2:
         return (
             f"{standing} of {len(timestamp_s)} time stamps repeat the one before; give the seconds "
@@ -115,10 +109,11 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
         return ""
     for unit, in_a_second in _TIME_UNITS:
         if _STEP_S[0] <= step / in_a_second < _STEP_S[1]:
+            right = f"divide them by {in_a_second:.0f}"
+            if in_a_second < 1:
+                right = f"multiply them by {1 / in_a_second:.0f}"
             what = f"the time stamps look like {unit}: their median step is {step:.6g}"
-            if in_a_second > 1:
-                return f"{what}; divide them by {in_a_second:.0f}, {remedy}"
-            return f"{what}; multiply them by {1 / in_a_second:.0f}, {remedy}"
+            return f"{what}; {right}, {remedy}"
     return ""
 
 

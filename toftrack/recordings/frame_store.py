@@ -50,18 +50,16 @@ class FrameStore:
         """Close the file, if one is open; it opens again by itself."""
 
 
-def file_of(path: str | Path, suffix: str = "") -> Path:
+def file_of(path: str | Path) -> Path:
     """The path of a recording that is one file; ToftrackError where there is no file, or none to be
     opened.
     """
-    path, give = Path(path).expanduser(), f"give the path of a recording{suffix}"
+    path, give = Path(path).expanduser(), "give the path of a recording"
     with reading(path):  # too long a name
-        is_folder, is_there = path.is_dir(), path.exists()
-    if is_folder:
-        raise ToftrackError(f"'{path}' is a directory; {give}")
-    if not is_there:
-        raise ToftrackError(f"there is no file '{path}'; {give}")
-    with reading(path):
+        if path.is_dir():
+            raise ToftrackError(f"'{path}' is a directory; {give}")
+        if not path.exists():
+            raise ToftrackError(f"there is no file '{path}'; {give}")
         check_readable(path)
     return path
 

@@ -29,12 +29,12 @@ from typing import IO, Any, Self
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_number, reported_errors
 from toftrack.files.archives import MOST_TEXT_BYTES, broken_is_value_error
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_new, open_to_read, write_whole
 from toftrack.frames.camera import Camera
-from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, BareFacts, check_metres, is_positive
+from toftrack.recordings.bare import MILLIMETRE, MOST, NOTHING_GIVEN, BareFacts, check_metres
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of
 from toftrack.recordings.images import decoded_depth, pages_of
 
@@ -149,8 +149,7 @@ class ImageFolder(FrameStore):
         unit_m = bare.unit_m or stated.get("depth_unit_m", MILLIMETRE if whole else 1.0)
         fps = bare.fps or stated.get("fps", DEFAULT_FPS)
         for name, value in (("depth_unit_m", unit_m), ("fps", fps)):
-            if not is_positive(value):
-                raise ToftrackError(f"{name} must be a positive number, but is {value!r} ({path})")
+            check_number(name, value, 0, MOST, above=True, remedy=f" ({path})")
         self.unit_m, self.fps = float(unit_m), float(fps)
         times_s = _timestamps(files, depth)
         self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
@@ -263,16 +262,11 @@ def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
             f"{files.what} has images in {len(folders)} folders, {', '.join(folders[:5])}; give "
             "one of them" + (" by itself" if isinstance(files, ZippedFiles) else "")
         )
-    if not others:
-        return depth, amplitude, None
-    return (
-        depth,
-        amplitude,
-        (
-            f"{len(others)} images that are not depth, as '{others[0]}', are left out; depth are "
-            f"'{depth[0]}' and {len(depth) - 1} others"
-        ),
+    left_out = others and (
+        f"{len(others)} images that are not depth, as '{others[0]}', are left out; depth are "
+        f"'{depth[0]}' and {len(depth) - 1} others"
     )
+    return depth, amplitude, left_out or None
 
 
 def _last(name: str) -> str:

@@ -23,9 +23,9 @@ LARGEST_PIXELS = 64_000_000
 _LENGTH, _SIZE = struct.Struct(">I"), struct.Struct(">II")
 
 
-def read_png(path: Path, kind: type, shape: tuple[int, ...] | None = None) -> np.ndarray:
-    """An image of exactly that type and shape (colours in the order blue, green, red); None = of
-    any size, without colours. ToftrackError when it cannot be read, is damaged, or of another kind.
+def read_png(path: Path, kind: type, shape: tuple[int, ...]) -> np.ndarray:
+    """An image of exactly that type and shape (colours in the order blue, green, red).
+    ToftrackError when it cannot be read, is damaged, or of another kind.
     """
     with reported_errors(f"the image '{path}' cannot be read", "check its permissions"):
         with open_to_read(path) as stream:
@@ -33,10 +33,8 @@ def read_png(path: Path, kind: type, shape: tuple[int, ...] | None = None) -> np
     image = decoded_png(content)
     if image is None:
         raise ToftrackError(f"the image '{path}' is damaged, or no PNG; copy or record it again")
-    right_shape = image.ndim == 2 if shape is None else image.shape == shape
-    if image.dtype != kind or not right_shape:
-        size = "x".join(map(str, image.shape[1::-1] + image.shape[2:]))
-        wanted = "grey" if shape is None else "x".join(map(str, shape[1::-1] + shape[2:]))
+    if image.dtype != kind or image.shape != shape:
+        size, wanted = ("x".join(map(str, s[1::-1] + s[2:])) for s in (image.shape, shape))
         raise ToftrackError(
             f"the image '{path}' is {size} of {image.dtype}, but must be {wanted} of "
             f"{np.dtype(kind)}; all depth images must be of one size, 16-bit grey in steps of a "

@@ -60,13 +60,8 @@ def _said(path: Path, *name: str) -> bytes:
         _check_unpacked(path)
     except zlib.error as error:
         raise ValueError(str(error)) from None
-    command = [
-        sys.executable,
-        "-P",
-        "-c",
-        _PROGRAM,
-        *name,
-    ]  # no modules of the folder that we are in
+    # -P: no modules of the folder that we are in.
+    command = [sys.executable, "-P", "-c", _PROGRAM, *name]
     with open_to_read(path) as stream:
         done = subprocess.run(command, stdin=stream, capture_output=True, check=False)
     if done.returncode != 0:

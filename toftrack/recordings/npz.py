@@ -47,8 +47,7 @@ from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, ra
 LOADED_BYTES = MOST_BYTES
 """Longer recordings are not loaded: their images are read in turn."""
 _IMAGES = ("depth_m", "radial_m", "amplitude")
-_POLYNOMIAL = ("depth_polynomial", "depth_polynomial_range_m")
-_CAMERA = ("K", "distortion", "lens", *_POLYNOMIAL)
+_CAMERA = ("K", "distortion", "lens", "depth_polynomial", "depth_polynomial_range_m")
 _TRUTH: dict[str, tuple[type, tuple[int, ...]]] = {
     "joints_m": (np.float32, (21, 3)),
     "visible": (bool, ()),
@@ -82,7 +81,6 @@ class StreamedImages:
                 "read in turn only as numbers in C order; save it so (numpy.ascontiguousarray)"
             )
         self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
-        self.size = int(np.prod(header.shape, dtype=object))
         self._images: Generator[np.ndarray] | None = None
         self._latest: tuple[int, np.ndarray] | None = None
 
@@ -157,7 +155,7 @@ def read_recording(path: str | Path) -> Recording:
     """Read and check a recording. ToftrackError, one sentence that names the file, when it is
     missing, damaged, contains pickled objects or breaks the format above.
     """
-    path = file_of(path, " (.npz)")
+    path = file_of(path)
     try:
         with reading(path), open_to_read(path) as stream:
             arrays = _read_archive(path, Archive(stream))
@@ -217,7 +215,7 @@ def write_recording(
 
 def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
     # Of unknown keys, too, before anything is used: a file that carries objects is not ours.
-    headers = {name: archive.header(name, None) for name in archive.names}
+    headers = {name: archive.header(name) for name in archive.names}
     if not {"depth_m", "radial_m"} & headers.keys():
         some = ", ".join(headers)[:_MOST_NAMED]
         raise ToftrackError(
@@ -289,10 +287,8 @@ def _check_depth(depth: Images, key: str) -> Images:
     whole = depth.dtype.kind in "iu"
     if not whole and depth.dtype.kind != "f":
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
-    if len(depth) == 0:
-        raise ToftrackError(f"'{key}' has zero frames; record at least one")
-    if depth.size == 0:
-        raise ToftrackError(f"the images of '{key}' are empty, shape {depth.shape}")
+    if 0 in depth.shape:
+        raise ToftrackError(f"'{key}' is empty, shape {depth.shape}; record at least one frame")
     some = some_images(depth)
     median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
@@ -349,28 +345,18 @@ def _metadata(arrays: dict[str, Any]) -> dict[str, Any]:
 
 def camera_arrays(camera: Camera) -> dict[str, np.ndarray]:
     """Its arrays by key; those of what most cameras do not have only where this one does."""
-    arrays = {"K": np.asarray(camera.K), "distortion": np.asarray(camera.distortion)}
-    if camera.lens != "opencv":
-        arrays["lens"] = np.array(camera.lens)
-    for key in _POLYNOMIAL:
-        if values := getattr(camera, key):
-            arrays[key] = np.array(values)
-    return arrays
+    content = camera.to_dict()
+    return {key: np.array(content[key]) for key in _CAMERA if content.get(key)}
 
 
 def _camera_of(arrays: dict[str, Any], width: int, height: int) -> Camera:
     """The camera of images of that size, px; `K` must be there. Raises ToftrackError."""
-    lens = arrays.get("lens", np.array("opencv"))
-    if lens.size != 1 or lens.dtype.kind != "U":
-        raise ToftrackError("'lens' must be one text, opencv or fisheye")
-    return Camera(
-        arrays["K"],
-        width,
-        height,
-        arrays.get("distortion", np.zeros(5)),
-        lens=lens.reshape(()).item(),
-        **{key: arrays[key] for key in _POLYNOMIAL if key in arrays},
-    )
+    given: dict[str, Any] = {key: arrays[key] for key in _CAMERA if key in arrays}
+    if "lens" in given:
+        if given["lens"].size != 1 or given["lens"].dtype.kind != "U":
+            raise ToftrackError("'lens' must be one text, opencv or fisheye")
+        given["lens"] = given["lens"].item()
+    return Camera(width=width, height=height, **given)
 
 
 def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:

@@ -92,7 +92,6 @@ class Recorder:
         self._second = ThreadPoolExecutor(1, "toftrack-amplitude")
         self._thread = threading.Thread(target=self._run, name="toftrack-recorder", daemon=True)
         self._thread.start()
-        self._closed = False
 
     def put(self, frame: Frame, wait: bool) -> None:
         """Record a frame.  wait: where too many wait to be written, wait, too, or leave it out."""
@@ -108,11 +107,9 @@ class Recorder:
 
     def close(self) -> None:
         """Write what waits, and finish the file."""
-        if not self._closed:
-            self._closed = True
-            self._queue.put(None)
-            self._thread.join()
-            self._second.shutdown()
+        self._queue.put(None)
+        self._thread.join()
+        self._second.shutdown()
 
     def words(self) -> str:
         """What became of it, once it is closed; "" where no frame came."""
@@ -152,10 +149,9 @@ class Recorder:
         try:
             self._write(frame)
             space = self._file.has_space(_SPARE_BYTES)
-        except OSError as error:
-            self._end(error.strerror or str(error), failed=True)
         except Exception as error:  # of whatever kind, nobody is to wait for this thread
-            self._end(str(error) or type(error).__name__, failed=True)
+            reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
+            self._end(reason, failed=True)
         else:
             if self._file.bytes >= self._limit_gb * _GIGABYTE:
                 self._end(f"it has {self._limit_gb:g} GB, its limit", failed=False)

@@ -34,9 +34,7 @@ def encoding(message: Any, kind: str) -> str:
 def is_depth(words: str) -> bool:
     """An `encoding` is one of depth images."""
     transport = words.partition(";")[2]
-    return words.startswith(("16UC1", "32FC1")) and (
-        not transport or "compressedDepth" in transport or _lossless(words)
-    )
+    return words.startswith(("16UC1", "32FC1")) and (not transport or _lossless(words))
 
 
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
@@ -146,9 +144,7 @@ def decoded_rvl(content: bytes) -> np.ndarray:
 
 def _lossless(words: str) -> bool:
     transport = words.partition(";")[2]
-    if "compressedDepth" in transport:
-        return True
-    return "png" in transport
+    return "compressedDepth" in transport or "png" in transport
 
 
 def _colour(words: str) -> str:
@@ -168,7 +164,9 @@ def camera_of(info: Any, rectified: bool) -> Camera:
     free of distortion already: what they are seen through is P. ToftrackError, which begins with
     "it", where it is not calibrated or of another model.
     """
-    stated = {name: np.asarray(_field(info, name), np.float64).ravel() for name in "KPD"}
+    # ROS 1 writes these names with a capital letter, ROS 2 with a small one.
+    names = {name: name if hasattr(info, name) else name.lower() for name in "KPD"}
+    stated = {k: np.asarray(getattr(info, name), np.float64).ravel() for k, name in names.items()}
     K, P, distortion = stated["K"].reshape(3, 3), stated["P"].reshape(3, 4), stated["D"]
     if rectified and P[0, 0] > 0:
         return Camera(*_window(info, np.diag([P[0, 0], P[1, 1], 1.0]), P[0, 2], P[1, 2]))
@@ -198,8 +196,3 @@ def _window(info: Any, focal: np.ndarray, cx: float, cy: float) -> tuple[np.ndar
     # As image_geometry has it, without the half pixel by which a bin's centre lies elsewhere.
     K[:2, 2] = np.array((cx - roi.x_offset, cy - roi.y_offset)) / bins
     return K, int(size[0]), int(size[1])
-
-
-def _field(info: Any, name: str) -> Any:
-    """A field that ROS 1 writes with a capital letter and ROS 2 with a small one."""
-    return getattr(info, name) if hasattr(info, name) else getattr(info, name.lower())

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -170,10 +170,12 @@ class _Bag:
         if reader is not None:
             reader.close()
 
-    def topics(self, kind: str) -> list[str]:
-        """The names of the topics of a type of messages that hold any."""
+    def firsts(self, kind: str) -> Iterator[tuple[str, Any]]:
+        """The topics of a type of messages that hold any, each with its first one."""
         connections = self.reader().connections
-        return sorted({c.topic for c in connections if c.msgtype == kind and c.msgcount})
+        for name in sorted({c.topic for c in connections if c.msgtype == kind and c.msgcount}):
+            for _, first in islice(self.messages(name, kind), 1):
+                yield name, first
 
     def messages(self, name: str, kind: str, start_ns: int = 0) -> Iterator[Any]:
         """When recorded, ns, and the message, of a topic and type, from then on."""
@@ -184,17 +186,11 @@ class _Bag:
             for _, recorded_ns, data in reader.messages(connections, start=start_ns or None):
                 yield recorded_ns, parse(data, kind)
 
-    @contextmanager
-    def _reported(self) -> Iterator[None]:
+    def _reported(self) -> AbstractContextManager[None]:
         """What rosbags says of a damaged bag becomes one sentence; it raises errors of any kind."""
-        try:
-            yield
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise ToftrackError(
-                f"the bag '{self.path}' cannot be read ({reason}); it is damaged or no bag: "
-                f"{_REPAIR[self.path.suffix.lower() if self.path.is_file() else '']}"
-            ) from error
+        repair = _REPAIR[self.path.suffix.lower() if self.path.is_file() else ""]
+        what = f"the bag '{self.path}' cannot be read"
+        return reported_errors(what, f"it is damaged or no bag: {repair}", Exception)
 
 
 def _choose(bag: _Bag, wanted: str | None) -> _Topic:
@@ -205,7 +201,11 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
                 f"'{bag.path}' is a recording of a camera's own program, which only that can read: "
                 f"play it with device={device} device.bag=FILE"
             )
-    images = list(_image_topics(bag))
+    images = [
+        _Topic(name, kind, encoding(first, kind), first)
+        for kind in (IMAGE, COMPRESSED)
+        for name, first in bag.firsts(kind)
+    ]
     if wanted is not None:
         for topic in images:
             if topic.name == "/" + wanted.strip("/") or topic.name == wanted:
@@ -231,19 +231,6 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
     return depth[0]
 
 
-def _image_topics(bag: _Bag) -> Iterator[_Topic]:
-    for kind in (IMAGE, COMPRESSED):
-        for name, first in _firsts(bag, kind):
-            yield _Topic(name, kind, encoding(first, kind), first)
-
-
-def _firsts(bag: _Bag, kind: str) -> Iterator[tuple[str, Any]]:
-    """The topics of a type, each with its first message."""
-    for name in bag.topics(kind):
-        for _, first in islice(bag.messages(name, kind), 1):
-            yield name, first
-
-
 def _listed(topics: list[_Topic]) -> str:
     return ", ".join(f"{topic.name} ({topic.encoding})" for topic in topics) or "none"
 
@@ -251,7 +238,7 @@ def _listed(topics: list[_Topic]) -> str:
 def _camera(bag: _Bag, topic: _Topic) -> Camera:
     """The lens of a topic's images: its camera_info, wherever in the bag that comes."""
     sibling = f"{topic.base.rpartition('/')[0]}/camera_info"
-    infos = dict(_firsts(bag, CAMERA_INFO))
+    infos = dict(bag.firsts(CAMERA_INFO))
     if sibling not in infos:
         frame = topic.first.header.frame_id
         fitting = [name for name, info in infos.items() if frame and info.header.frame_id == frame]

@@ -185,21 +185,18 @@ class SrsRecording(FrameStore):
 
     radial = True
 
-    def __init__(
-        self, path: Path, offsets: np.ndarray, timestamp_s: np.ndarray, scan: _Scan, range_m: float
-    ) -> None:
-        facts = scan.facts
-        self.path = path
-        self.camera = facts.camera or nominal_camera()
-        self.range_m = range_m
-        self.timestamp_s = timestamp_s
-        self.fps = rate_of(timestamp_s, facts.fps)
-        self.metadata = facts.metadata
+    def __init__(self, path: Path, scan: _Scan, default_range_m: float) -> None:
+        facts, stamps = scan.facts, np.array(scan.stamps, np.float64)
+        usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
+        self.path, self.camera = path, facts.camera or nominal_camera()
+        self.range_m = facts.range_m or default_range_m
+        self.timestamp_s = stamps if usable else np.arange(len(stamps)) / facts.fps
+        self.fps = rate_of(self.timestamp_s, facts.fps)
+        self.metadata, self.damage = facts.metadata, scan.damage
         self.init = scan.init or SrsInit()
         self.registers = scan.registers
         """The first Configure object's 64 bytes."""
-        self.damage = scan.damage
-        self._offsets = offsets
+        self._offsets = scan.offsets
         self._stream: BinaryIO | None = None
 
     def raw(self, index: int) -> bytes:
@@ -207,7 +204,7 @@ class SrsRecording(FrameStore):
         with reading(self.path):
             if self._stream is None:
                 self._stream = open_to_read(self.path)
-            self._stream.seek(int(self._offsets[index]))
+            self._stream.seek(self._offsets[index])
             data = self._stream.read(FRAME_BYTES)
         if len(data) != FRAME_BYTES:
             raise ToftrackError(f"the recording '{self.path}' became shorter while it was read")
@@ -231,17 +228,13 @@ def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> 
     registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
     file, of another version, in a wrong order or without any whole frame.
     """
-    path, default_range_m = file_of(path, " (.srs)"), unambiguous_range_m(modulation_mhz)
+    path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
     with reading(path), open_to_read(path) as stream:
         scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
     if not scan.offsets:
         reason = f" ({scan.damage})" if scan.damage else ""
         raise ToftrackError(f"the recording '{path}' has no whole frame{reason}; record it again")
-    stamps = np.array(scan.stamps, np.float64)
-    usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
-    timestamp_s = stamps if usable else np.arange(len(stamps)) / scan.facts.fps
-    range_m = scan.facts.range_m or default_range_m
-    return SrsRecording(path, np.array(scan.offsets, np.int64), timestamp_s, scan, range_m)
+    return SrsRecording(path, scan, default_range_m)
 
 
 @dataclass

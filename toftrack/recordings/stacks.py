@@ -15,7 +15,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.errors import ToftrackError, module_of_extra, reported_errors
 from toftrack.files.archives import MOST_BYTES
 from toftrack.files.safe_files import open_to_read
 from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_metres, size_of
@@ -58,7 +58,8 @@ class Stack(FrameStore):
         at[self._order[0]] = index
         with _reported(self.path, f"frame {index} of "):
             image = np.asarray(self._images[tuple(at)])
-        depth = image.astype(np.float32) * np.float32(self.unit_m)
+        with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading
+            depth = image.astype(np.float32) * np.float32(self.unit_m)
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         return (depth.T.copy() if self._order[1] > self._order[2] else depth), None
 
@@ -96,16 +97,9 @@ def read_stack(path: str | Path, camera_file: str | Path | None, bare: BareFacts
 @contextmanager
 def _reported(path: Path, what: str = "") -> Iterator[None]:
     """Whatever a library says of a damaged file becomes one sentence; they raise all kinds."""
-    try:
-        with reading(path):
-            yield
-    except ToftrackError:
-        raise
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise ToftrackError(
-            f"{what}'{path}' cannot be read ({reason}); it is damaged, or of another kind"
-        ) from error
+    what, remedy = f"{what}'{path}' cannot be read", "it is damaged, or of another kind"
+    with reported_errors(what, remedy, Exception), reading(path):
+        yield
 
 
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:

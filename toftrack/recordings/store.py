@@ -25,7 +25,6 @@ _BY_OPENNI = (
     "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
     "(docs/formats.md) and give the folder"
 )
-_BY_IMAGES = "export its depth frames as 16-bit PNG images or .npy, and convert those"
 _BY_FOLDER = "a recording is the folder that the images lie in; give that"
 _BY_NUMBERS = "save the depth images as 16-bit PNG, numbered, and give their folder"
 _BY_ARRAY = "save its depth as .npy (frames, rows, columns), and give that"
@@ -41,17 +40,15 @@ SAMPLES = (FIRST_SAMPLE, "left_hand", "two_hands", "point_and_pinch", "glass")
 """The recordings that come with the package; toftrack/data/README.md says what they show."""
 ELSEWHERE = {
     ".oni": _BY_OPENNI,
-    ".xef": _BY_IMAGES,
-    ".rrf": _BY_IMAGES,
     ".ply": _BY_POINTS,
     ".pcd": _BY_POINTS,
-    ".klg": "write its depth out as 16-bit PNG images (a logger's own tools do), give their folder",
     ".r3d": "export its depth from Record3D as EXR images, and give their folder",
     ".csv": "a table is no image; " + _BY_ARRAY,
     ".sens": "take its depth out by ScanNet's reader as 16-bit PNG images, and give their folder",
     ".part": "it is unfinished: toftrack recover FILE makes a recording of it",
     ".jsonl": "it is what a tracker found, not what a camera saw; give the recording",
     **dict.fromkeys((".svo", ".svo2", ".xed", ".vrs", ".dng", ".heic", ".rrd", ".ifs"), _BY_SDK),
+    **dict.fromkeys((".xef", ".rrf", ".klg"), _BY_SDK),
     **dict.fromkeys((".png", ".exr"), _BY_FOLDER),
     **dict.fromkeys((".pgm", ".pfm", ".dpt", ".jp2", ".jxl"), _BY_NUMBERS),
     **dict.fromkeys((".raw", ".bin", ".dat", ".depth", ".zarr", ".parquet", ".txt"), _BY_ARRAY),

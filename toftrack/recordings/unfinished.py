@@ -158,7 +158,7 @@ def finish(part: Path, path: Path, overwrite: bool = False) -> int:
         f"make room, then `toftrack recover {part}`",
     ):
         with _locked(part) as stream:
-            facts, frames = _read(stream, part)
+            facts, frames = _read_facts(stream, part), list(_records(stream))
             if not frames:
                 raise ToftrackError(f"'{part}' has no whole frame, so there is nothing to make")
             if not overwrite and os.path.lexists(path):
@@ -282,18 +282,12 @@ def _in_pieces(source: BinaryIO, size: int) -> Iterator[bytes]:
         yield piece
 
 
-def _read(stream: BinaryIO, path: Path) -> tuple[Facts, list[_Kept]]:
-    """What a file holds, up to the last whole frame."""
-    stream.seek(0)
+def _read_facts(stream: BinaryIO, path: Path) -> Facts:
     if stream.read(len(_FIRST_LINE)) != _FIRST_LINE:
         raise ToftrackError(
             f"'{path}' is no unfinished recording of toftrack's; give FILE.npz{SUFFIX}, or the "
             "output folder of a run"
         )
-    return _read_facts(stream, path), list(_records(stream))
-
-
-def _read_facts(stream: BinaryIO, path: Path) -> Facts:
     try:
         length, check = _BLOCK.unpack(stream.read(_BLOCK.size))
         text = stream.read(min(length, _LARGEST_FACTS))
@@ -312,6 +306,7 @@ def _read_facts(stream: BinaryIO, path: Path) -> Facts:
 
 
 def _records(stream: BinaryIO) -> Iterator[_Kept]:
+    """The frames behind the facts, up to the last whole one."""
     end = os.fstat(stream.fileno()).st_size
     while len(head := stream.read(_RECORD.size)) == _RECORD.size:
         mark, index, timestamp_s, *sizes_and_sums = _RECORD.unpack(head)

@@ -97,7 +97,9 @@ class RealSense(SdkCamera):
                 camera_file,
                 lambda: camera_of(rs, own),
                 transport=transport if bag is None else "recording",
-                **_facts(rs, self._device),
+                model=_info(rs, self._device, "name"),
+                serial=_info(rs, self._device, "serial_number"),
+                firmware=_info(rs, self._device, "firmware_version"),
                 infrared=self._infrared is not None,
                 preset=preset,
                 realtime=bool(realtime),
@@ -196,8 +198,10 @@ def load_sdk(otherwise: str = "") -> ModuleType:
         return _imported()
     except ImportError as error:
         if "libusb" in str(error):
+            # The wheels leave libusb to the system; a loaded one of that name serves, too.
             with contextlib.suppress(ImportError, OSError):
-                _preload_libusb()
+                path = importlib.import_module("libusb_package").get_library_path()
+                ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
                 return _imported()
             raise ToftrackError(
                 "pyrealsense2 needs libusb-1.0, which is not installed: pip install "
@@ -216,12 +220,6 @@ def _imported() -> ModuleType:
     return rs
 
 
-def _preload_libusb() -> None:
-    # The wheels of pyrealsense2 leave libusb to the system; a loaded one of that name serves, too.
-    path = importlib.import_module("libusb_package").get_library_path()
-    ctypes.CDLL(str(path), mode=ctypes.RTLD_GLOBAL)
-
-
 def _found(rs: ModuleType, serial: str | int | None) -> Any:
     """The plugged-in camera of that serial number, the only one for None; else ToftrackError."""
     with reported_errors(
@@ -230,12 +228,6 @@ def _found(rs: ModuleType, serial: str | int | None) -> Any:
         found = {_info(rs, device, "serial_number"): device for device in rs.context().devices}
     otherwise = ", or try it without a camera with device.transport=emulated"
     return found[chosen_serial(list(found), serial, "RealSense", otherwise)]
-
-
-def _facts(rs: ModuleType, device: Any) -> dict[str, Any]:
-    """What the camera says of itself, JSON-able."""
-    names = {"model": "name", "serial": "serial_number", "firmware": "firmware_version"}
-    return {key: _info(rs, device, name) for key, name in names.items()}
 
 
 def _info(rs: ModuleType, device: Any, name: str) -> str:

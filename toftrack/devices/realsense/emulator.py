@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_source
 
@@ -36,11 +36,9 @@ class EmulatorSettings:
     unit_m: float
 
     def __post_init__(self) -> None:
-        if (self.fps is not None and not self.fps > 0) or not self.unit_m > 0:
-            raise ToftrackError(
-                "device.emulated needs fps and unit_m above 0, but they are "
-                f"{self.fps} and {self.unit_m}"
-            )
+        check_number("device.emulated.unit_m", self.unit_m, 0, above=True)
+        if self.fps is not None:
+            check_number("device.emulated.fps", self.fps, 0, above=True)
 
 
 class EmulatedCamera:

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from toftrack.devices.base import BaseDevice
+from toftrack.devices.base import BaseDevice, check_keep
 from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.libmesasr import MesaTransport
 from toftrack.devices.sr3000.transport import (
@@ -30,7 +30,7 @@ from toftrack.devices.sr3000.transport import (
     UsbSettings,
 )
 from toftrack.devices.sr3000.usb import WHEN_IT_DOES_NOT_ANSWER, UsbTransport
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH, decode_frame, nominal_camera
@@ -69,12 +69,11 @@ class Sr3000(BaseDevice):
         persistence: Persistence,
         camera_file: str | Path | None,
     ) -> None:
-        sensible = queue_frames >= 1 and (stop is None or stop >= 1) and fps > 0
-        if keep not in ("newest", "every") or not sensible:
-            raise ToftrackError(
-                "device=sr3000 needs keep=newest or every, queue_frames and stop of at least 1 and "
-                f"fps above 0, but they are {keep}, {queue_frames}, {stop} and {fps}"
-            )
+        check_keep(keep)
+        check_number("device.queue_frames", queue_frames, 1, whole=True)
+        check_number("device.fps", fps, 0, above=True)
+        if stop is not None:
+            check_number("device.stop", stop, 1, whole=True)
         self.exposure = Exposure(modulation_mhz, integration_time, amplitude_threshold)
         super().__init__(nominal_camera(), fps, frames=stop, live=keep == "newest")
         self.emulator: EmulatedBackend | None = None
@@ -88,12 +87,10 @@ class Sr3000(BaseDevice):
         self._usb = usb
         self._transport: Transport
         number = None if serial is None else str(serial)
-        if transport == "usb":
-            self._transport = UsbTransport(usb, self.exposure, number)
-        elif transport == "libmesasr":
+        if transport == "libmesasr":
             self._transport = MesaTransport(libmesasr, self.exposure, number)
-        elif transport == "emulated":
-            backend = self._emulate(emulated)
+        elif transport in ("usb", "emulated"):
+            backend = self._emulate(emulated) if transport == "emulated" else None
             self._transport = UsbTransport(usb, self.exposure, number, backend)
         else:
             raise ToftrackError(

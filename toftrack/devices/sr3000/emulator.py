@@ -23,7 +23,7 @@ import usb.core
 from usb.backend import IBackend
 
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
 
@@ -160,11 +160,9 @@ class EmulatorSettings:
         object.__setattr__(self, "faults", tuple(self.faults))
         object.__setattr__(self, "serials", tuple(map(str, self.serials)))
         _parse_faults(self.faults)
-        if (self.fps is not None and not self.fps > 0) or self.fault_every < 0:
-            raise ToftrackError(
-                "device.emulated needs fps above 0 and fault_every of 0 or more, but they are "
-                f"{self.fps} and {self.fault_every}"
-            )
+        check_number("device.emulated.fault_every", self.fault_every, 0, whole=True)
+        if self.fps is not None:
+            check_number("device.emulated.fps", self.fps, 0, above=True)
 
 
 @dataclass(frozen=True)
@@ -220,7 +218,7 @@ class EmulatedBackend(IBackend):
         self._opens = self._position = self._splits = self._cycled = 0
         self._last_due_s = -np.inf
         self._plugging = 0
-        self._back_s: float | None = 0.0
+        self._back_s = 0.0
         self._random = np.random.default_rng(0)
 
     @property
@@ -230,17 +228,13 @@ class EmulatedBackend(IBackend):
             over = not self._settings.loop and self._position >= len(self._source)
             return over and not self._queue
 
-    def unplug(self, seconds: float | None = None) -> None:
-        """Pull the cameras out, for some time or (None) until `plug_in`; the scene goes on."""
+    def unplug(self, seconds: float) -> None:
+        """Pull the cameras out for some time; the scene goes on."""
         with self._lock:
             self._plugging += 1
-            self._back_s = None if seconds is None else time.monotonic() + seconds
+            self._back_s = time.monotonic() + seconds
             self._queue.clear()
             self._stalled = False
-
-    def plug_in(self) -> None:
-        with self._lock:
-            self._back_s = 0.0
 
     # What pyusb asks of a backend.
 
@@ -393,7 +387,7 @@ class EmulatedBackend(IBackend):
     # The camera itself.
 
     def _plugged(self) -> bool:
-        return self._back_s is not None and time.monotonic() >= self._back_s
+        return time.monotonic() >= self._back_s
 
     def _check_plugged(self, device: _Id) -> None:
         if device.plugging != self._plugging or not self._plugged():
