@@ -62,37 +62,8 @@ def test_kinematics_agree_with_products_of_matrix_exponentials(side: str) -> Non
     joints = forward_kinematics(states, shape).joints_m
     expected = torch.stack([joints_by_matrix_exponentials(state, shape) for state in states])
     torch.testing.assert_close(joints, expected, atol=1e-9, rtol=0)
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_bone_lengths_do_not_change_with_the_pose(dtype: torch.dtype) -> None:
-    shape = default_hand_shape().to(dtype)
-    joints = forward_kinematics(random_states(200, dtype=dtype), shape).joints_m
-    fingers = joints[:, 1:].unflatten(1, (5, 4))
-    lengths = fingers.diff(dim=2).norm(dim=-1)
-    torch.testing.assert_close(lengths, shape.bone_lengths_m.expand_as(lengths), atol=3e-6, rtol=0)
-    palm = (fingers[:, :, 0] - joints[:, :1]).norm(dim=-1)
-    torch.testing.assert_close(palm, shape.base_m.norm(dim=-1).expand_as(palm), atol=3e-6, rtol=0)
-
-
-def test_a_rigid_motion_moves_all_joints_with_it() -> None:
-    shape = default_hand_shape().to(torch.float64)
-    states = random_states(10)
-    still = states.clone()
-    still[:, :6] = 0
-    local = forward_kinematics(still, shape)
-    moved = forward_kinematics(states, shape)
-    rotation = moved.frames[:, 0]
-    expected = local.joints_m @ rotation.mT + states[:, None, :3]
-    torch.testing.assert_close(moved.joints_m, expected, atol=1e-9, rtol=0)
-
-
-def test_a_left_hand_is_the_mirror_image_of_a_right_one() -> None:
-    states = random_states(10)
-    states[:, :6] = 0
-    right = forward_kinematics(states, default_hand_shape().to(torch.float64)).joints_m
-    left = forward_kinematics(states, default_hand_shape(side="left").to(torch.float64)).joints_m
-    torch.testing.assert_close(left, right * torch.tensor([-1.0, 1, 1], dtype=torch.float64))
+    single = forward_kinematics(states.float(), shape.to(torch.float32)).joints_m
+    torch.testing.assert_close(single.double(), expected, atol=3e-6, rtol=0)
 
 
 def test_flexion_curls_towards_the_palm_and_abduction_towards_the_thumb() -> None:

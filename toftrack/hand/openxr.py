@@ -57,13 +57,7 @@ _WORLD = np.array([1.0, -1.0, -1.0])
 
 # Joints of the 21 that are joints of OpenXR as they are, and where these stand there.
 _SAME = [0, 1, 2, 3, *(4 * finger + joint for finger in range(1, 5) for joint in (1, 2, 3))]
-JOINT_OF_FRAME = [
-    1,
-    2,
-    3,
-    4,
-    *(2 + 5 * finger + bone for finger in range(1, 5) for bone in range(3)),
-]
+JOINT_OF_FRAME = [1, 2, 3, 4, *(first + bone for first in (7, 12, 17, 22) for bone in range(3))]
 """Which joint of OpenXR moves as each of the 16 frames of a HandPose does."""
 _TIPS, _TIPS_THERE = [4, 8, 12, 16, 20], [5, 10, 15, 20, 25]
 _METACARPALS_THERE = [6, 11, 16, 21]
