@@ -31,7 +31,6 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
 from toftrack.output.results import read_results
-from toftrack.output.stream import ReaderGoneError
 
 NUMBERS = np.random.default_rng(0)
 
@@ -140,14 +139,6 @@ def test_a_terminal_that_stands_still_stops_nothing() -> None:
         for descriptor in (before, main, terminal):
             with suppress(OSError):
                 os.close(descriptor)
-
-
-def test_a_reader_that_goes_away_is_reported_at_once() -> None:
-    with piped() as pipe:
-        with pytest.raises(ReaderGoneError, match="Broken pipe"), stdout_stream() as stream:
-            stream.send((estimate(0),))
-            pipe.close()
-            stream.send((estimate(1),))
 
 
 def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
