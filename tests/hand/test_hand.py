@@ -88,25 +88,18 @@ def test_thickness_changes_the_fingers_breadth_but_no_joint() -> None:
     )
 
 
-def test_a_shape_file_round_trips(tmp_path) -> None:
-    shape = dataclasses.replace(default_hand_shape(0.18, "left"), thickness=1.1)
-    shape.save(tmp_path / "shape.json")
-    loaded = make_hand_shape(str(tmp_path / "shape.json"), side="left")
+def test_a_shape_file_round_trips_and_says_how_the_shape_was_fitted(tmp_path) -> None:
+    path = tmp_path / "shape.json"
+    fitted = Fitted(("length", "thumb"), (-0.1, 0.02), ((4e-4, 1e-5), (1e-5, 9e-4)), 7.5, True)
+    shape = dataclasses.replace(default_hand_shape(0.18, "left"), thickness=1.1, fitted=fitted)
+    shape.save(path)
+    loaded = make_hand_shape(str(path), side="left")
     torch.testing.assert_close(loaded.base_m, shape.base_m)
     torch.testing.assert_close(loaded.bone_lengths_m, shape.bone_lengths_m)
     torch.testing.assert_close(loaded.base_frames, shape.base_frames)
-    assert (loaded.side, loaded.thickness) == ("left", 1.1)
-
-
-def test_a_shape_file_says_how_the_shape_was_fitted(tmp_path) -> None:
-    fitted = Fitted(("length", "thumb"), (-0.1, 0.02), ((4e-4, 1e-5), (1e-5, 9e-4)), 7.5, True)
-    path = tmp_path / "shape.json"
-    dataclasses.replace(default_hand_shape(), fitted=fitted).save(path)
-    assert make_hand_shape(str(path)).fitted == fitted
-    assert json.loads(path.read_text())["fitted"]["sigma"] == pytest.approx(
-        {"length": 0.02, "thumb": 0.03}
-    )
+    assert (loaded.side, loaded.thickness, loaded.fitted) == ("left", 1.1, fitted)
     content = json.loads(path.read_text())
+    assert content["fitted"]["sigma"] == pytest.approx({"length": 0.02, "thumb": 0.03})
     for damage in ({"components": 3}, {"poses": "many"}, {"covariance": [[1]]}):
         path.write_text(json.dumps({**content, "fitted": {**content["fitted"], **damage}}))
         with pytest.raises(ToftrackError, match="damaged"):

@@ -151,9 +151,7 @@ def test_datagrams_that_nobody_takes_stop_nothing_and_are_counted(
     host: str, words: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = programs.free_port(socket.SOCK_DGRAM)
     with udp_stream(host, port) as stream:
         for i in range(50):
             stream.send((hand_estimate(i),))
