@@ -37,12 +37,6 @@ from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
 
 @pytest.fixture
-def view() -> Iterator[BrowserView]:
-    with closing(made()) as view:
-        yield view
-
-
-@pytest.fixture
 def visitor(view: BrowserView) -> Iterator[Visitor]:
     with Visitor(view.url) as visitor:
         yield visitor
