@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from helpers.hands import hand_estimate, lost_hand
+from helpers.programs import free_port
 from helpers.tracking import ROOT, sample
 
 import toftrack
@@ -69,12 +70,6 @@ def module(monkeypatch: pytest.MonkeyPatch, name: str, **content: Any) -> None:
     monkeypatch.setitem(sys.modules, name, made)
 
 
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        return int(free.getsockname()[1])
-
-
 def test_blender_s_empties_go_where_the_hands_are(monkeypatch: pytest.MonkeyPatch) -> None:
     objects: dict[str, SimpleNamespace] = {}
     linked: list[SimpleNamespace] = []
@@ -91,7 +86,7 @@ def test_blender_s_empties_go_where_the_hands_are(monkeypatch: pytest.MonkeyPatc
         context=SimpleNamespace(scene=scene),
         app=SimpleNamespace(timers=SimpleNamespace(register=timers.append)),
     )
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     code = (EXAMPLES / "blender_receiver.py").read_text().replace("5005", str(port))
     names: dict[str, Any] = {}
     exec(compile(code, "blender_receiver.py", "exec"), names)
@@ -151,7 +146,7 @@ class Play {
 def test_unity_s_component_compiles_and_moves_its_balls(tmp_path: Path) -> None:
     if shutil.which("mcs") is None:
         pytest.skip("there is no C# compiler (mcs)")
-    port = free_port()
+    port = free_port(socket.SOCK_DGRAM)
     code = (EXAMPLES / "HandReceiver.cs").read_text().replace("5005", str(port))
     (tmp_path / "HandReceiver.cs").write_text(code)
     (tmp_path / "Unity.cs").write_text(UNITY)

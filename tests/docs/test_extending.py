@@ -268,18 +268,6 @@ def test_distances_of_points_from_an_ellipsoid_are_exact_on_it(
     assert 0.005 < found[3] < 0.05, "the middle is inside"
 
 
-def test_the_point_to_surface_likelihood_prefers_the_true_pose(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    overrides = ("likelihood=point_to_surface", "experiment=paper", "hand.side=right")
-    tracker = toftrack.make_tracker(*overrides, "gestures=none", config_dir=EXAMPLES)
-    scene = sample()
-    for index in range(3):
-        estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
-    assert type(tracker.model.likelihood).__name__ == "PointToSurface"
-    assert 1e3 * np.linalg.norm(estimate.joints_m - scene.joints_m[2], axis=1).mean() < 25
-
-
 @pytest.mark.parametrize("given", [True, False])
 def test_a_likelihood_tracks_as_the_page_says_and_else_hears_of_its_threshold(
     given: bool, tmp_path: Path
@@ -326,9 +314,16 @@ def test_a_score_that_is_none_is_one_sentence(score: str, said: str, mine: Path)
     assert "\n" not in str(caught.value)
 
 
-def test_a_likelihood_of_rendered_depths_prefers_the_true_pose(mine: Path) -> None:
-    given = ("likelihood=depths", "filter.exponent=20", "lost.score=0.2", *PAPER)
-    tracker, scene = toftrack.make_tracker(*given, config_dir=mine / "my_conf"), sample()
+@pytest.mark.parametrize(
+    ("name", "more"), [("point_to_surface", ()), ("depths", ("filter.exponent=20",))]
+)
+def test_the_likelihoods_of_the_docs_prefer_the_true_pose(
+    name: str, more: tuple[str, ...], mine: Path
+) -> None:
+    folder = EXAMPLES if name == "point_to_surface" else mine / "my_conf"
+    given = (f"likelihood={name}", "lost.score=0.2")
+    tracker = toftrack.make_tracker(*given, *more, *PAPER, config_dir=folder)
+    scene = sample()
     for index in range(3):
         estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
     assert not estimate.lost
@@ -403,8 +398,7 @@ def camera(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., int]]:
     serve, threads = importlib.import_module("socket_camera").serve, []
 
     def start(*sent: bytes, recording: Path | None = None) -> int:
-        with socket.create_server(("127.0.0.1", 0)) as free:
-            port = int(free.getsockname()[1])
+        port = programs.free_port()
 
         def send() -> None:
             with socket.create_server(("127.0.0.1", port)) as server:

@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.data_sets import Scene, scene, write_icvl, write_msra, write_nyu
+from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
+from helpers.tracking import Scene
 from scipy.io import savemat
 
 from toftrack.errors import ToftrackError
@@ -61,7 +62,7 @@ def test_what_was_written_is_read(name: str, sequence: str, side: str, tmp_path:
     assert [s.name for s in sequences] == [sequence]
     read = sequences[0]
     assert (len(read.images), read.side, read.left_out) == (FRAMES, side, 0)
-    np.testing.assert_array_equal(read.camera.K, seen.K)
+    np.testing.assert_array_equal(read.camera.K, seen.k)
     for index in range(FRAMES):
         depth = read.frame(index)
         assert depth.dtype == np.float32

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 import torch
 from helpers.settings import gestures, part
-from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose, seen
+from helpers.shown_gestures import GESTURES, ON, SURE, fingers, label_of, pose
 from helpers.tracking import follow as follow_scene
 from helpers.tracking import sample
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.gestures.features import features
+from toftrack.gestures.features import features_of_angles as seen
 from toftrack.gestures.recognition import GestureState, pointing_ray, tell_gesture, update
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -40,18 +41,13 @@ def estimate(angles: np.ndarray, name: str = "tracking", lost: bool = False) -> 
     state[0, 2] = 0.5
     state[0, 6:] = torch.from_numpy(angles)
     joints = forward_kinematics(state, default_hand_shape()).joints_m[0].numpy()
-    return Estimate(
-        index=0,
-        timestamp_s=0.0,
-        state_name=name,
+    return no_estimate(0, 0.0, name, 4, 0.0).updated(
         lost=lost,
         joints_m=joints,
+        joint_ok=np.ones(21, bool),
         state=state[0].numpy(),
         latent=SPACE.encode(state[:, 6:])[0].numpy(),
         score=SURE,
-        covariance=np.zeros((10, 10), np.float32),
-        effective_sample_size=1.0,
-        compute_s=0.0,
     )
 
 

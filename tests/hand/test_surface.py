@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import pytest
 import torch
 from torch import Tensor
 
@@ -64,10 +63,9 @@ def test_there_is_more_flesh_on_the_palm_side_of_the_fingers() -> None:
     assert (SURFACE.centres_m[:-1, 2].abs() < 0.5 * thickest)[SURFACE.frame_index[:-1] > 0].all()
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_both_hands_have_the_same_flesh(side: str) -> None:
+def test_both_hands_have_the_same_flesh() -> None:
     """Only the skeleton is mirrored."""
-    shape = default_hand_shape(side=side).to(torch.float64)
+    shape = default_hand_shape(side="left").to(torch.float64)
     torch.testing.assert_close(hand_surface(shape).axes_m, SURFACE.axes_m)
 
 

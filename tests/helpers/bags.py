@@ -6,7 +6,6 @@ import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import cv2
@@ -156,14 +155,6 @@ def camera_info(camera: Camera, model: str = "plumb_bob", **changes: Any) -> dic
         "binning_y": 0,
         "roi": roi,
     } | changes
-
-
-def as_message(fields: dict) -> SimpleNamespace:
-    """The fields as an object, as rosbags parses them."""
-    fields = dict(fields)
-    if "roi" in fields:
-        fields["roi"] = SimpleNamespace(**fields["roi"])
-    return SimpleNamespace(**fields)
 
 
 def recording(

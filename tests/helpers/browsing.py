@@ -11,8 +11,6 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-import cv2
-import numpy as np
 from helpers.moments import tracked, with_hand
 from helpers.settings import browser_view
 from helpers.tracking import make_tracker
@@ -21,10 +19,8 @@ from websockets.sync.client import connect
 from toftrack.devices.replay import Sample
 from toftrack.views.base import TrackedFrame
 from toftrack.views.browser.view import BrowserView
-from toftrack.views.overlay import CAPTION_PX, draw_tracked
 
 PATIENCE_S = 20
-_MEMORY = np.full((144, 176), 1000, np.uint16)
 
 
 @cache
@@ -36,34 +32,6 @@ def moments() -> tuple[TrackedFrame, ...]:
 
 def made(**settings: float) -> BrowserView:
     return browser_view("", 25.0, None, port=0, **settings)
-
-
-def numbered(number: int) -> TrackedFrame:
-    """A frame that shows its number modulo 8 twice: as the grey of the image's upper left corner,
-    and by how far to the right the skeleton is. All have the same memory, as some devices' frames.
-    """
-    moment, number = moments()[0], number % 8
-    _MEMORY[:16, :16] = 1000 * ((20 + 30 * number) / 255) ** 2
-    joints = moment.estimates[0].joints_m + np.float32([0.012 * number - 0.05, 0, 0])
-    shown = with_hand(moment, estimate=replace(moment.estimates[0], joints_m=joints))
-    return replace(shown, frame=replace(moment.frame, amplitude=_MEMORY))
-
-
-def numbers_of(picture: bytes) -> tuple[int, int]:
-    """The numbers that an encoded picture of `numbered` shows, by its image and by its skeleton."""
-    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[:, :528]
-    places = np.abs(np.array(_skeletons()) - _skeleton(pixels))
-    return round((pixels[5:40, 5:40].mean() - 20) / 30), int(places.argmin())
-
-
-def _skeleton(pixels: np.ndarray) -> float:
-    """Where it lies, across."""
-    return float(np.nonzero(np.ptp(pixels.astype(int), axis=2) > 60)[1].mean())
-
-
-@cache
-def _skeletons() -> list[float]:
-    return [_skeleton(draw_tracked(numbered(n))[CAPTION_PX:, :528]) for n in range(8)]
 
 
 class Visitor:

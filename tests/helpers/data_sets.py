@@ -2,52 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
-from importlib import resources
 from pathlib import Path
 
 import cv2
 import numpy as np
+from helpers.tracking import Scene, sample
 from scipy.io import savemat
 
 from toftrack.frames.camera import Camera
-from toftrack.recordings.npz import Recording, read_recording
 
 THUMB_LAST = [0, *range(5, 21), *range(1, 5)]
 """toftrack's rows in MSRA's order."""
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """Frames of the sample as another camera at the same place would have seen them."""
-
-    depth_m: np.ndarray
-    """(T, H, W) float32 metres."""
-    joints_m: np.ndarray
-    """(T, 21, 3) metres, camera frame."""
-    K: np.ndarray
-
-
-@cache
-def _sample() -> Recording:
-    return read_recording(str(resources.files("toftrack") / "data" / "sample.npz"))
-
-
 def scene(camera: Camera, frames: int) -> Scene:
-    """The first frames of the sample recording through a camera."""
-    sample = _sample()
-    assert sample.truth is not None
+    """The first frames of the sample as another camera at the same place would have seen them."""
     rows, columns = np.mgrid[: camera.height, : camera.width].astype(np.float32)
-    ours, theirs = sample.camera.K, camera.K
+    ours, theirs = sample().k, camera.K
     u = (columns - theirs[0, 2]) / theirs[0, 0] * ours[0, 0] + ours[0, 2]
     v = (rows - theirs[1, 2]) / theirs[1, 1] * ours[1, 1] + ours[1, 2]
     u, v = u.astype(np.float32), v.astype(np.float32)
     depth = [
-        cv2.remap(sample.image(index)[0], u, v, cv2.INTER_NEAREST, borderValue=0)
-        for index in range(frames)
+        cv2.remap(seen, u, v, cv2.INTER_NEAREST, borderValue=0)
+        for seen in sample().depth_m[:frames]
     ]
-    return Scene(np.array(depth), sample.truth.joints_m[:frames].astype(float), theirs)
+    return Scene(np.array(depth), theirs, sample().joints_m[:frames])
 
 
 def write_msra(folder: Path, seen: Scene, boxed: bool) -> None:
@@ -78,7 +57,7 @@ def write_icvl(folder: Path, seen: Scene, name: str = "test_seq_1") -> None:
     lines = []
     for index, (depth, joints) in enumerate(zip(seen.depth_m, seen.joints_m, strict=True)):
         points = np.concatenate([joints[[0, 9]].mean(0, keepdims=True), joints[rows]])
-        uv = points[:, :2] / points[:, 2:] * np.diag(seen.K)[:2] + seen.K[:2, 2]
+        uv = points[:, :2] / points[:, 2:] * np.diag(seen.k)[:2] + seen.k[:2, 2]
         labels = np.concatenate([uv, 1e3 * points[:, 2:]], axis=1).ravel()
         lines.append(f"{name}/image_{index:04d}.png " + " ".join(f"{v:.3f}" for v in labels))
         words = np.round(1e3 * depth).astype(np.uint16)

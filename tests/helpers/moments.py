@@ -8,11 +8,6 @@ from typing import Any
 import numpy as np
 
 from toftrack.devices.base import Device
-from toftrack.frames.camera import Camera
-from toftrack.frames.estimate import Estimate
-from toftrack.frames.frame import Frame
-from toftrack.hand.shape import HandShape
-from toftrack.tracking.state import StepInfo
 from toftrack.tracking.tracker import Tracker
 from toftrack.views.base import TrackedFrame, TrackedHand
 
@@ -23,21 +18,9 @@ def tracked(device: Device, tracker: Tracker) -> list[TrackedFrame]:
     for frame in device:
         depth, shape = device.camera.rectify(frame.depth, frame.radial), tracker.shape
         estimate = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
-        insight = tracker.hands.insights[0]
-        kept.append(one_hand(frame, depth, device.camera, estimate, shape, insight))
+        hand = TrackedHand(estimate, shape, tracker.hands.insights[0])
+        kept.append(TrackedFrame(frame, depth, device.camera, (hand,)))
     return kept
-
-
-def one_hand(
-    frame: Frame,
-    depth_m: np.ndarray,
-    camera: Camera,
-    estimate: Estimate,
-    shape: HandShape,
-    insight: StepInfo | None = None,
-) -> TrackedFrame:
-    """A moment with one slot."""
-    return TrackedFrame(frame, depth_m, camera, (TrackedHand(estimate, shape, insight),))
 
 
 def two_hands(moment: TrackedFrame, shift_m: float = 0.15, **changes: Any) -> TrackedFrame:

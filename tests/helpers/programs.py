@@ -7,6 +7,7 @@ import logging
 import os
 import runpy
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -62,6 +63,13 @@ def call(*arguments: str, folder: Path, program: str = "track.py") -> tuple[int,
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 1
     return status, out.getvalue(), err.getvalue()
+
+
+def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
+    """A port of this machine that nobody listens at."""
+    with socket.socket(socket.AF_INET, kind) as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 @contextmanager

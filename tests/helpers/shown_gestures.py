@@ -27,9 +27,5 @@ def fingers(*curled: int) -> np.ndarray:
     return angles
 
 
-def seen(angles: np.ndarray) -> np.ndarray:
-    return features_of_angles(angles)
-
-
 def label_of(angles: np.ndarray, gestures: Gestures = GESTURES, off: float = ON) -> str:
-    return update(None, seen(angles), SURE, off, gestures)[1]
+    return update(None, features_of_angles(angles), SURE, off, gestures)[1]

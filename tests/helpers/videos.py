@@ -12,8 +12,6 @@ import av
 import cv2
 import numpy as np
 
-from toftrack.frames.camera import Camera
-
 START_OFFSET_S = 0.5
 """Of the camera's clock in `write_kinect`."""
 RATIONAL = (0.55, -0.02, 1e-3, -2e-3, -0.0027, 0.89, 0.086, -0.014)
@@ -41,23 +39,6 @@ def calibration(K: np.ndarray, across: int, corner: tuple[int, int], lens: Any =
     }
     colour = {"Purpose": "CALIBRATION_CameraPurposePhotoVideo"}
     return {"CalibrationInformation": {"Cameras": [colour, camera]}}
-
-
-def seen_through(camera: Camera, depth: np.ndarray, pinhole: Camera) -> np.ndarray:
-    """The (H, W) depth of a pinhole camera as another lens in its place sees it.
-
-    Interpolated on surfaces; at edges, where the neighbours lie apart, the nearest pixel.
-    """
-    at = pinhole.project(
-        np.dstack((camera.normalised_rays(), np.ones((camera.height, camera.width))))
-    )
-    u, v = np.moveaxis(at.astype(np.float32), -1, 0)
-    nearest = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderValue=0)
-    between = cv2.remap(depth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    square = np.ones((3, 3), np.uint8)
-    apart = cv2.dilate(depth, square) - cv2.erode(depth, square)
-    edge = cv2.remap(apart, u, v, cv2.INTER_NEAREST, borderValue=1) > 0.02
-    return np.where(edge | (nearest == 0), nearest, between)
 
 
 def write_kinect(
@@ -103,19 +84,6 @@ def write_grey(
     """(T, H, W) uint16 images as a lossless grey video."""
     container = av.open(str(path), "w")
     _encode(container, [_grey(container, codec, pixels, words.shape, fps)], [words], fps)
-    return path
-
-
-def write_colour(path: Path, count: int = 5) -> Path:
-    """A video as telephones make them."""
-    container = av.open(str(path), "w")
-    stream = container.add_stream("mpeg4", rate=25)
-    stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-    for _ in range(count):
-        frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), "rgb24")
-        container.mux(stream.encode(frame))
-    container.mux(stream.encode())
-    container.close()
     return path
 
 

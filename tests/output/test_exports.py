@@ -1,34 +1,25 @@
-"""A run as glTF, BVH and CSV: read back with the formats' own rules, and compared with the run."""
+"""A run as glTF: read back with the format's own rules, and compared with the run."""
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
-from helpers.animation import Gltf, read_bvh
+from helpers.animation import Gltf
 from helpers.hands import hand_estimate, lost_hand
 
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
-from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.exports import glb_of, hand_mesh, motions_of
-from toftrack.programs.export import bvh_of, csv_of
 
-NAMES = ("index", "timestamp_s", "state_name", "lost", "side", "joints_m", "state", "gesture")
-MORE = (
-    *("confidence", "joint_ok", "pinching", "pointing_origin_m", "pointing_direction"),
-    "openxr_position_m",
-)
+NAMES = ("timestamp_s", "lost", "side", "joints_m", "state")
 
 
 def results_of(estimates: list[Estimate]) -> dict[str, Any]:
-    columns = {n: np.array([getattr(e, n) for e in estimates]) for n in NAMES + MORE}
-    return columns | {"joint_names": JOINT_NAMES}
+    return {name: np.array([getattr(one, name) for one in estimates]) for name in NAMES}
 
 
 def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
@@ -101,34 +92,3 @@ def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
     for frame, held in ((0, 1), (3, 2), (4, 2)):
         for name, place in gltf.world(frame).items():
             assert np.allclose(place, gltf.world(held)[name]), (frame, name)
-
-
-def test_a_bvh_puts_the_joints_where_they_were() -> None:
-    estimates = moving("left")
-    (motion,) = motions_of(results_of(estimates), (default_hand_shape(side="left"),))
-    text = bvh_of(motion)
-    names, found = read_bvh(text)
-    assert "Frames: 8\nFrame Time: 0.040000\n" in text
-    assert len(names) == 25 and names[0] == "Wrist_L" and "Ring_Distal_L" in names
-    wrist = 100 * np.stack([e.openxr_position_m[1] for e in estimates])
-    assert np.allclose(found[:, -1], wrist, atol=0.001)  # the root ends last
-    for joint, name in enumerate(OPENXR_JOINT_NAMES):
-        if name == "palm":
-            continue
-        there = 100 * np.stack([e.openxr_position_m[joint] for e in estimates])
-        assert np.linalg.norm(found - there[:, None], axis=-1).min(1).max() < 0.01, name
-
-
-def test_a_csv_has_a_row_a_frame_and_a_column_a_number() -> None:
-    estimates = [lost_hand(0), *moving(lost=(2,))[1:]]
-    rows = list(csv.DictReader(io.StringIO(csv_of(results_of(estimates)))))
-    assert len(rows) == 8
-    assert rows[0]["wrist_x_m"] == "" and rows[0]["lost"] == "1" and rows[2]["lost"] == "1"
-    for row, estimate in zip(rows[1:], estimates[1:], strict=True):
-        assert (row["index"], row["side"]) == (str(estimate.index), "right")
-        assert float(row["timestamp_s"]) == pytest.approx(estimate.timestamp_s, abs=1e-6)
-        for number, name in enumerate(JOINT_NAMES):
-            place = [float(row[f"{name}_{axis}_m"]) for axis in "xyz"]
-            assert place == pytest.approx(estimate.joints_m[number].tolist(), abs=1e-5)
-            assert row[f"{name}_ok"] == str(int(estimate.joint_ok[number]))
-        assert row["pointing_origin_x_m"] == ""

@@ -10,6 +10,7 @@ import json
 import math
 import shutil
 import tracemalloc
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 from helpers.hands import hand_estimate
 
+import toftrack
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import coverage, evaluate
 from toftrack.evaluation.trust import judged, trust
@@ -61,14 +63,17 @@ def estimate(index: int, **changes: Any) -> Estimate:
 
 def write(
     folder: Path,
-    estimates: list[Estimate],
+    estimates: Sequence[Estimate | tuple[Estimate, ...]],
     truth: Truth | None = None,
-    more: dict[str, Any] | None = None,
-) -> ResultWriter:
-    with ResultWriter(folder, {"seed": 1} | (more or {}), NAMES, truth) as writer:
+    **config: Any,
+) -> dict[str, Any]:
+    """The summary of a run that did these frames."""
+    metadata = {"seed": 1} | ({"config": config} if config else {})
+    with ResultWriter(folder, metadata, NAMES, truth) as writer:
         for one in estimates:
-            writer.append((one,))
-    return writer
+            writer.append(one if isinstance(one, tuple) else (one,))
+    assert writer.summary is not None
+    return writer.summary
 
 
 def lines_of(folder: Path) -> list[dict[str, Any]]:
@@ -120,6 +125,7 @@ def test_a_reader_without_this_package_can_draw_the_hand_into_the_image(tmp_path
     camera = {"K": [[200.0, 0, 87.5], [0, 210.0, 71.5], [0, 0, 1]], "width": 176, "height": 144}
     with ResultWriter(tmp_path, {"camera": camera}, JOINT_NAMES) as writer:
         writer.append((hand_estimate(3),))
+    default_hand_shape().save(tmp_path / "hand_shape.json")
     with np.load(tmp_path / "track.npz", allow_pickle=False) as archive:
         run = dict(archive)
     assert all(word in str(run["readme"]) for word in ("Metres", "x right, y down", "u = K"))
@@ -132,6 +138,13 @@ def test_a_reader_without_this_package_can_draw_the_hand_into_the_image(tmp_path
     pixels = np.stack((k[0, 0] * x / z + k[0, 2], k[1, 1] * y / z + k[1, 2]), 1)
     parts = (pixels + 0.5) / run["image_size_px"]
     assert np.allclose(parts[:, 0], run["landmarks"][0, :, 0], atol=1e-5)
+    again = toftrack.read_run(tmp_path)
+    assert set(again.arrays) == set(run) - {"metadata", "joint_names"}
+    assert again.arrays["angle_names"].tolist() == list(toftrack.ANGLE_NAMES)
+    assert again.summary["frames"] == len(again) == len(again.timestamp_s) == 1
+    assert (again.camera.width, again.camera.height) == (176, 144)
+    np.testing.assert_array_equal(again.camera.K, k)
+    assert again.estimate(0).index == 3
 
 
 def test_each_line_is_on_disk_when_its_frame_is_done(tmp_path: Path) -> None:
@@ -165,9 +178,9 @@ def test_frames_without_estimate_are_null_in_lines_and_nan_in_arrays(tmp_path: P
 
 
 def test_summary_counts_and_averages(tmp_path: Path) -> None:
-    writer = write(tmp_path, [estimate(i) for i in range(5)])
+    written = write(tmp_path, [estimate(i) for i in range(5)])
     summary = json.loads((tmp_path / "summary.json").read_text())
-    assert summary == writer.summary and "metrics" not in summary
+    assert summary == written and "metrics" not in summary
     assert (summary["frames"], summary["lost_frames"]) == (5, 1)
     figures = [summary[name] for name in ("mean_ms", "median_ms", "fps", "mean_score")]
     assert figures == pytest.approx([30, 30, 100 / 3, 0.52])
@@ -176,7 +189,7 @@ def test_summary_counts_and_averages(tmp_path: Path) -> None:
 def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     estimates = [estimate(i) for i in range(12)]
     truth = truth_of(estimates, frames=20)  # the run was interrupted after 12 of 20
-    summary = write(tmp_path, estimates, truth).summary
+    summary = write(tmp_path, estimates, truth)
     joints = np.array([one.joints_m for one in estimates])
     lost = np.array([one.lost for one in estimates])
     now = truth[:12]
@@ -203,21 +216,21 @@ def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
 def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
     done = [estimate(i) for i in range(3, 15) if i != 7]  # 0 to 2 were faulty, 7 came too late
     truth = truth_of([estimate(i) for i in range(20)], 20)[1:]
-    summary = write(tmp_path, done, truth).summary
+    summary = write(tmp_path, done, truth)
     assert truth.first == 1 and summary["frames"] == 12
     errors = np.full(12, 10 * math.sqrt(3))
     stale = 1e3 * np.linalg.norm(done[3].joints_m - truth.joints_m[6], axis=1).mean()
     assert summary["metrics"]["mean_mm"] == pytest.approx(errors[5:].mean(), rel=1e-3)
     assert summary["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
-    asked = write(tmp_path, done, truth, {"config": {"count_dropped": True}}).summary
+    asked = write(tmp_path, done, truth, count_dropped=True)
     errors[4] = min(stale, 1e3)
     assert asked["metrics"]["trust"]["mean_all_mm"] == pytest.approx(errors.mean(), rel=1e-3)
 
 
 def test_frames_beyond_the_truth_are_not_judged(tmp_path: Path) -> None:
-    summary = write(tmp_path / "a", [estimate(i) for i in range(9)], truth_of([], 4)).summary
+    summary = write(tmp_path / "a", [estimate(i) for i in range(9)], truth_of([], 4))
     assert summary["metrics"]["trust"]["frames"] == 4
-    summary = write(tmp_path / "b", [estimate(i) for i in range(9, 12)], truth_of([], 4)).summary
+    summary = write(tmp_path / "b", [estimate(i) for i in range(9, 12)], truth_of([], 4))
     assert "metrics" not in summary
 
 
@@ -305,7 +318,7 @@ def test_memory_does_not_grow_with_the_frames(
 def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) -> None:
     odd = estimate(4, score=math.inf, gesture="", joints_m=np.full((21, 3), -np.inf))
     many = [no_estimate(0, 0.0, "searching", 4, 0.01), *(estimate(i) for i in range(1, 4)), odd]
-    summary, before = write(tmp_path, many).summary, read_results(tmp_path / "track.npz")
+    summary, before = write(tmp_path, many), read_results(tmp_path / "track.npz")
     assert before["joint_names"] == NAMES and before["metadata"] == {"seed": 1}
     for name in ("track.npz", "summary.json"):
         (tmp_path / name).unlink()
@@ -368,7 +381,7 @@ def test_what_a_killed_run_left_unfinished_is_dropped(tmp_path: Path, rest: byte
 def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     done = [estimate(i) for i in (2, 3, 6, 7)]
     truth = Truth(np.zeros((6, 21, 3)), np.ones(6, bool), np.ones(6, bool))
-    summary = write(tmp_path, done, truth).summary
+    summary = write(tmp_path, done, truth)
     content = read_results(tmp_path / "track.npz")
     shown = [estimate(i) for i in (2, 3, 3, 3, 6, 7)]
     np.testing.assert_array_equal(content["joints_m"], np.array([one.joints_m for one in shown]))
@@ -382,15 +395,6 @@ def test_dropped_frames_repeat_the_newest_estimate(tmp_path: Path) -> None:
     assert [line["index"] for line in read_lines(tmp_path / "track.jsonl")] == [2, 3, 6, 7]
     assert summary["frames"] == 6
     assert summary["mean_ms"] == pytest.approx(1e3 * np.mean([one.compute_s for one in done]))
-
-
-def test_a_file_that_is_no_result_is_reported(tmp_path: Path) -> None:
-    path = tmp_path / "track.npz"
-    with pytest.raises(ToftrackError, match="track.npz"):
-        read_results(path)
-    path.write_bytes(b"PK\x03\x04broken")
-    with pytest.raises(ToftrackError, match="track.npz"):
-        read_results(path)
 
 
 @pytest.mark.parametrize(
@@ -413,10 +417,14 @@ def test_arrays_that_do_not_fit_together_are_no_result(
     np.savez(path, **(arrays | changes))
     with pytest.raises(ToftrackError, match=r"is not a track\.npz, or it is damaged"):
         read_results(path)
+    path.write_bytes(b"PK\x03\x04broken")
+    with pytest.raises(ToftrackError, match=r"track\.npz"):
+        read_results(path)
+    with pytest.raises(ToftrackError, match="cannot be read"):
+        read_results(tmp_path / "nowhere.npz")
 
 
 FRAMES = 12
-TWO = {"config": {"hands": 2}}
 
 
 def vacant(index: int) -> Estimate:
@@ -444,18 +452,8 @@ def two_truths() -> Truth:
     return Truth(joints[1], there, yes, other=Truth(joints[0], yes, yes))
 
 
-def write_slots(
-    folder: Path, estimates: list[tuple[Estimate, ...]], known: Truth | None = None
-) -> dict[str, Any]:
-    with ResultWriter(folder, TWO, NAMES, known) as writer:
-        for both in estimates:
-            writer.append(both)
-    assert writer.summary is not None
-    return writer.summary
-
-
 def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path: Path) -> None:
-    write_slots(tmp_path, two_hands())
+    write(tmp_path, two_hands(), hands=2)
     lines = lines_of(tmp_path)
     assert all(tuple(line) == (*FRAME_FIELDS, "hands") for line in lines)
     assert set(FRAME_FIELDS) | set(HAND_FIELDS) == set(LINE_FIELDS)
@@ -471,7 +469,7 @@ def test_a_line_lists_the_hands_that_are_there_each_with_slot_and_side(tmp_path:
 
 def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_path: Path) -> None:
     done = two_hands()
-    write_slots(tmp_path, done)
+    write(tmp_path, done, hands=2)
     content = read_results(tmp_path / "track.npz")
     for name in set(FRAME_FIELDS) & set(KINDS):
         assert content[name].shape == (FRAMES,), name
@@ -492,7 +490,7 @@ def test_arrays_have_an_axis_of_slots_and_nothing_where_there_is_no_hand(tmp_pat
 
 def test_each_true_hand_is_measured_in_the_slot_that_followed_it(tmp_path: Path) -> None:
     known = two_truths()
-    metrics = write_slots(tmp_path, two_hands(), known)["metrics"]
+    metrics = write(tmp_path, two_hands(), known, hands=2)["metrics"]
     content = read_results(tmp_path / "track.npz")
     assert (metrics["slot"], metrics["second"]["slot"]) == (1, 0)
     for found, one in ((metrics, known), (metrics["second"], known.other)):
@@ -517,7 +515,7 @@ def test_a_result_that_cannot_be_written_is_reported(tmp_path: Path) -> None:
 
 
 def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
-    write_slots(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)])
+    write(tmp_path, [both for both in two_hands() if both[0].index not in (2, 7)], hands=2)
     content = read_results(tmp_path / "track.npz")
     assert content["metadata"]["held_frames"] == [2, 7]
     assert np.flatnonzero(content["dropped"]).tolist() == [2, 7]
@@ -531,7 +529,7 @@ def test_dropped_frames_repeat_both_hands(tmp_path: Path) -> None:
 def test_the_summary_speaks_of_each_slot(tmp_path: Path) -> None:
     for slot, name in enumerate(("hand_shape.json", "hand_shape_2.json")):
         default_hand_shape(0.17 + slot / 100).of_side(("left", "right")[slot]).save(tmp_path / name)
-    summary = write_slots(tmp_path, two_hands())
+    summary = write(tmp_path, two_hands(), hands=2)
     assert (summary["frames"], summary["lost_frames"]) == (FRAMES, 0)
     first, second = summary["slots"]
     assert (first["frames"], second["frames"]) == (FRAMES, FRAMES - 3)

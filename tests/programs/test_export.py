@@ -78,12 +78,16 @@ def test_a_bvh_has_the_skeleton_of_a_hand_that_was_there(
     slots = {f"hand{slot}.bvh": side for slot, side in enumerate(sides, 1) if side}
     assert [path.name for path in made] == (["hand.bvh"] if len(sides) == 1 else list(slots))
     for path, side in zip(made, slots.values(), strict=True):
-        names, places = read_bvh(path.read_text())
-        assert names[0] == f"Wrist_{side[0].upper()}" and len(places) == FRAMES
+        text = path.read_text()
+        names, places = read_bvh(text)
+        assert f"Frames: {FRAMES}\nFrame Time: 0.040000\n" in text
+        assert len(names) == 25 and names[0] == f"Wrist_{side[0].upper()}"
+        assert len(places) == FRAMES and np.allclose(places[[MISSED]], places[3])
         for frame in (0, FRAMES - 1):
-            wrist = 100 * hand_estimate(frame, side, bent=0.1 * frame).openxr_position_m[1]
-            assert np.allclose(places[frame, -1], wrist, atol=0.001)  # the root ends last
-        assert np.allclose(places[[MISSED]], places[3])
+            there = 100 * hand_estimate(frame, side, bent=0.1 * frame).openxr_position_m[1:]
+            assert np.allclose(places[frame, -1], there[0], atol=0.001)  # the root ends last
+            away = np.linalg.norm(places[frame] - there[:, None], axis=-1)
+            assert away.min(1).max() < 0.01  # every joint is somewhere
 
 
 @pytest.mark.parametrize("sides", SLOTS)
@@ -105,6 +109,14 @@ def test_a_csv_has_a_row_a_frame_and_slot(
         assert (row["little_dip_flexion_rad"] != "") == there
         sure = row["little_tip_confidence"], row["wrist_sigma_ray_m"], row["wrist_sigma_across_m"]
         assert sure == (("0.9", "0.01", "0.01") if there else ("", "", ""))
+        if there and frame != MISSED:
+            assert float(row["timestamp_s"]) == pytest.approx(frame / 25, abs=1e-6)
+            hand = estimate(frame, sides[slot])
+            for joint, name in enumerate(JOINT_NAMES):
+                place = [float(row[f"{name}_{axis}_m"]) for axis in "xyz"]
+                assert place == pytest.approx(hand.joints_m[joint].tolist(), abs=1e-5)
+                assert row[f"{name}_ok"] == "1"
+            assert row["pointing_origin_x_m"] == ""
 
 
 def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: Path) -> None:

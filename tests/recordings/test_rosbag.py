@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import struct
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,6 @@ from helpers.bags import (
     INFO,
     KINDS,
     Message,
-    as_message,
     camera_info,
     compressed,
     image,
@@ -185,6 +185,14 @@ def test_a_damaged_message_ends_the_recording_before_it(tmp_path: Path) -> None:
 
 
 # Images and lenses, without a bag.
+
+
+def as_message(fields: dict) -> SimpleNamespace:
+    """The fields as an object, as rosbags parses them."""
+    fields = dict(fields)
+    if "roi" in fields:
+        fields["roi"] = SimpleNamespace(**fields["roi"])
+    return SimpleNamespace(**fields)
 
 
 def test_rows_may_be_padded_and_bytes_swapped() -> None:

@@ -6,13 +6,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from helpers.videos import (
     RATIONAL,
     START_OFFSET_S,
     calibration,
-    write_colour,
     write_grey,
     write_kinect,
 )
@@ -151,6 +151,19 @@ def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
     Camera(np.diag((30.0, 30, 1)), 8, 6).save(tmp_path / "camera.json")
     with pytest.raises(ToftrackError, match="8x6.*32x24"):
         Replay(path)
+
+
+def write_colour(path: Path, count: int = 5) -> Path:
+    """A video as telephones make them."""
+    container = av.open(str(path), "w")
+    stream = container.add_stream("mpeg4", rate=25)
+    stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
+    for _ in range(count):
+        frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), "rgb24")
+        container.mux(stream.encode(frame))
+    container.mux(stream.encode())
+    container.close()
+    return path
 
 
 def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:

@@ -3,10 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
 import pytest
+from helpers.browsing import made
 from helpers.chromium import headless_chromium
+
+from toftrack.views.browser.view import BrowserView
+
+
+@pytest.fixture
+def view() -> Iterator[BrowserView]:
+    """A live page without frames yet."""
+    with closing(made()) as view:
+        yield view
 
 
 @pytest.fixture(scope="session")

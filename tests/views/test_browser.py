@@ -7,6 +7,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
+from functools import cache
 from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
@@ -20,8 +21,6 @@ from helpers.browsing import (
     eventually,
     made,
     moments,
-    numbered,
-    numbers_of,
     ours,
     shown_again_and_again,
 )
@@ -31,15 +30,10 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import no_estimate, state_words
+from toftrack.views.base import TrackedFrame
 from toftrack.views.browser import view as browser
 from toftrack.views.browser.view import BrowserView
 from toftrack.views.overlay import CAPTION_PX, draw_tracked
-
-
-@pytest.fixture
-def view() -> Iterator[BrowserView]:
-    with closing(made()) as view:
-        yield view
 
 
 @pytest.fixture
@@ -68,6 +62,37 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view, visitor) -> None:
         assert facts[name] == pytest.approx(getattr(estimate, name), abs=1e-3)
     assert facts["gesture"] == estimate.gesture and facts["side"] == "right"
     assert (facts["doubted"], facts["dropped"]) == (["wrist", "thumb_cmc"], 5)
+
+
+MEMORY = np.full((144, 176), 1000, np.uint16)
+
+
+def numbered(number: int) -> TrackedFrame:
+    """A frame that shows its number modulo 8 twice: as the grey of the image's upper left corner,
+    and by how far to the right the skeleton is. All have the same memory, as some devices' frames.
+    """
+    moment, number = moments()[0], number % 8
+    MEMORY[:16, :16] = 1000 * ((20 + 30 * number) / 255) ** 2
+    joints = moment.estimates[0].joints_m + np.float32([0.012 * number - 0.05, 0, 0])
+    shown = with_hand(moment, estimate=replace(moment.estimates[0], joints_m=joints))
+    return replace(shown, frame=replace(moment.frame, amplitude=MEMORY))
+
+
+def numbers_of(picture: bytes) -> tuple[int, int]:
+    """The numbers that an encoded picture of `numbered` shows, by its image and by its skeleton."""
+    pixels = cv2.imdecode(np.frombuffer(picture, np.uint8), cv2.IMREAD_COLOR)[:, :528]
+    places = np.abs(np.array(skeletons()) - skeleton(pixels))
+    return round((pixels[5:40, 5:40].mean() - 20) / 30), int(places.argmin())
+
+
+def skeleton(pixels: np.ndarray) -> float:
+    """Where it lies, across."""
+    return float(np.nonzero(np.ptp(pixels.astype(int), axis=2) > 60)[1].mean())
+
+
+@cache
+def skeletons() -> list[float]:
+    return [skeleton(draw_tracked(numbered(n))[CAPTION_PX:, :528]) for n in range(8)]
 
 
 def test_image_skeleton_and_facts_are_of_one_frame_though_the_device_reuses_its_memory(

@@ -7,7 +7,6 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
@@ -131,12 +130,6 @@ def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -
     with pytest.raises(ZeroDivisionError), made():
         1 / 0  # noqa: B018
     assert len(stayed) == 2 and ours() == []
-
-
-@pytest.fixture
-def view() -> Iterator[BrowserView]:
-    with closing(made()) as view:
-        yield view
 
 
 def test_the_page_works_in_a_browser(chromium, view) -> None:

@@ -9,16 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers.hands import lost_hand
 from helpers.videos import video_frames
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate, no_estimate
-from toftrack.views.overlay import (
-    CAPTION_PX,
-    VideoView,
-    draw_panel,
-)
+from toftrack.views.overlay import CAPTION_PX, VideoView, draw_panel
 from toftrack.views.skeleton import SLOT_RGB
 
 W, H = 176, 144
@@ -44,10 +41,6 @@ def hand(lost: bool = False) -> Estimate:
         score=0.9,
         joint_ok=np.full(21, not lost),
     )
-
-
-def lost_hand() -> Estimate:
-    return no_estimate(7, 0.28, "lost", 4, 0.01)
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,13 +72,13 @@ def panel_sides(
     *estimates: Estimate, amplitude: np.ndarray | None = AMPLITUDE
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Of a panel without models: the caption and both sides."""
-    return sides(draw_panel(DEPTH, amplitude, CAMERA, estimates, [None] * len(estimates), 3))
+    return sides(draw_panel(DEPTH, amplitude, CAMERA, estimates, [0 * DEPTH] * len(estimates)))
 
 
 def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     near, far = np.zeros((H, W)), np.zeros((H, W))
     near[20:80, 100:150], far[20:80, 20:120] = 0.5, 0.6
-    return sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one, other), (near, far), 3))
+    return sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one, other), (near, far)))
 
 
 def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
@@ -132,7 +125,7 @@ def test_no_skeleton_without_an_estimate_behind_the_camera_or_far_outside_the_im
     behind = dataclasses.replace(hand(), joints_m=-hand().joints_m)
     away = hand().joints_m + np.array([1e6, 0, 0], np.float32)
     outside = dataclasses.replace(hand(), joints_m=away)
-    for one in (dataclasses.replace(lost_hand(), lost=False), behind, outside):
+    for one in (dataclasses.replace(lost_hand(7), lost=False), behind, outside):
         assert is_grey(panel_sides(one)[1])
 
 
@@ -140,7 +133,7 @@ def test_range_image_is_darker_where_nearer_on_white() -> None:
     model = np.zeros((H, W), np.float32)
     model[40:80, 40:80], model[40:80, 100:140] = 0.4, 0.6
     model[0, 0], model[0, 1] = np.nan, np.inf
-    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (model,), 3))
+    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (model,)))
     near, far, background = right[180, 180, 0], right[180, 360, 0], right[400, 30, 0]
     assert near < far < background == 255
     assert right[1, 1, 0] == right[1, 4, 0] == 255

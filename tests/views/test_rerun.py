@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.moments import tracked, two_hands, with_hand
+from helpers.programs import QUICK, free_port
 from helpers.settings import f_measure
 from helpers.tracking import configuration, make_tracker
 from hydra.utils import instantiate
@@ -27,7 +28,6 @@ from toftrack.errors import ToftrackError
 from toftrack.views.base import TrackedFrame
 from toftrack.views.classified import classify
 
-QUICK = ("filter.particles=100",)
 FRAMES = 6
 NAN = np.full(27, np.nan, np.float32)
 
@@ -169,12 +169,6 @@ def test_a_folder_that_cannot_be_written_is_reported(rerun_view, tmp_path: Path)
     with pytest.raises(ToftrackError, match="track.rrd' cannot be written"):
         view.show(moments()[0])
     view.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
 
 
 @pytest.mark.parametrize(

@@ -57,7 +57,8 @@ _WORLD = np.array([1.0, -1.0, -1.0])
 
 # Joints of the 21 that are joints of OpenXR as they are, and where these stand there.
 _SAME = [0, 1, 2, 3, *(4 * finger + joint for finger in range(1, 5) for joint in (1, 2, 3))]
-_SAME_THERE = [1, 2, 3, 4, *(2 + 5 * finger + bone for finger in range(1, 5) for bone in range(3))]
+JOINT_OF_FRAME = [1, 2, 3, 4, *(first + bone for first in (7, 12, 17, 22) for bone in range(3))]
+"""Which joint of OpenXR moves as each of the 16 frames of a HandPose does."""
 _TIPS, _TIPS_THERE = [4, 8, 12, 16, 20], [5, 10, 15, 20, 25]
 _METACARPALS_THERE = [6, 11, 16, 21]
 _KNUCKLES = [5, 9, 13, 17]
@@ -159,7 +160,7 @@ def _placed(joints: np.ndarray, state: np.ndarray, rig: OpenXRRig) -> tuple[np.n
     turned = Rotation.from_matrix(axes.reshape(-1, 3, 3)).as_quat(canonical=True)
 
     position = np.empty((len(joints), 26, 3))
-    position[:, _SAME_THERE] = _WORLD * joints[:, _SAME]
+    position[:, JOINT_OF_FRAME] = _WORLD * joints[:, _SAME]
     position[:, _METACARPALS_THERE] = _WORLD * metacarpals
     inset = rig.radius_m[_TIPS_THERE][:, None]
     position[:, _TIPS_THERE] = _WORLD * joints[:, _TIPS] - inset * ways[:, 2:15:3]
@@ -200,7 +201,6 @@ def openxr_rig(shape: HandShape) -> OpenXRRig:
     )
     # As deep in the palm as the line from the wrist to the knuckle is there.
     starts[:, 2] = knuckles[:, 2] * starts[:, 1] / knuckles[:, 1]
-    rig = OpenXRRig(shape.base_frames.numpy(), starts, np.zeros(26), shape.side == "left")
     surface = hand_surface(shape)
     rest = forward_kinematics(torch.zeros(1, 27, dtype=torch.float64), shape)
     flesh = surface.pose(rest)
@@ -208,9 +208,8 @@ def openxr_rig(shape: HandShape) -> OpenXRRig:
     for finger in range(5):
         _, along, depth = surface.axes_m[surface.frame_index == 3 + 3 * finger][0].diagonal()
         radius[_TIPS_THERE[finger]] = 2 * along * depth**2 / (along**2 + depth**2)
-    rig = rig._replace(radius_m=radius)
-    joints = rest.joints_m.numpy()
-    hand = openxr_hand(joints[0], np.zeros(27), rig)
+    rig = OpenXRRig(shape.base_frames.numpy(), starts, radius, shape.side == "left")
+    hand = openxr_hand(rest.joints_m[0].numpy(), np.zeros(27), rig)
     axes = unitquat_to_rotmat(torch.from_numpy(hand.orientation)).numpy()
     _, up, back = np.moveaxis(axes, 2, 0)
     points = hand.position_m + _NEIGHBOURHOOD_M[:, None, None] * back

@@ -51,7 +51,7 @@ def _add_overlaps(joints, ratio, out):
     for n in range(len(joints)):
         for finger in range(5):
             knuckle = 1 + 4 * finger
-            length = chord = 0.0
+            length = 0.0
             for bone in range(3):
                 length += distance(joints[n, knuckle + bone], joints[n, knuckle + bone + 1])
             chord = distance(joints[n, knuckle], joints[n, knuckle + 3])

@@ -61,14 +61,7 @@ ANGLE_LIMITS: tuple[tuple[float, float], ...] = tuple(
 
 # Every finger is a chain of three joints with the slots (abduction, flexion, abduction, flexion,
 # flexion): the thumb uses all five, the others have no abduction at their second joint.
-CHAIN_SLOTS: tuple[int, ...] = (
-    0,
-    1,
-    2,
-    3,
-    4,
-    *(5 * f + s for f in range(1, 5) for s in (0, 1, 3, 4)),
-)
+CHAIN_SLOTS = (*range(5), *(5 * f + s for f in range(1, 5) for s in (0, 1, 3, 4)))
 """Where each of the 21 angles goes in the (5 fingers x 5 slots) layout of the chain."""
 
 

@@ -19,9 +19,15 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from toftrack.errors import ToftrackError, module_of_extra
-from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS, openxr_hand, openxr_rig
+from toftrack.hand.openxr import (
+    JOINT_OF_FRAME,
+    OPENXR_JOINT_NAMES,
+    OPENXR_PARENTS,
+    openxr_hand,
+    openxr_rig,
+)
 from toftrack.hand.shape import SIDES, HandShape
-from toftrack.hand.skeleton import FINGERS, forward_kinematics
+from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
 
 _WRIST = OPENXR_JOINT_NAMES.index("wrist")
@@ -297,15 +303,6 @@ class _File:
 _POINTS = 146
 """Of an ellipsoid."""
 _WORLD = np.array([1.0, -1.0, -1.0])
-_JOINT_OF_FRAME = [
-    OPENXR_JOINT_NAMES.index(name)
-    for name in (
-        "wrist",
-        *(f"thumb_{bone}" for bone in ("metacarpal", "proximal", "distal")),
-        *(f"{f}_{bone}" for f in FINGERS[1:] for bone in ("proximal", "intermediate", "distal")),
-    )
-]
-"""Which joint moves as each of the 16 frames of a HandPose does."""
 
 
 class HandMesh(NamedTuple):
@@ -337,7 +334,7 @@ def hand_mesh(shape: HandShape) -> HandMesh:
     turned = np.where((np.linalg.det(axes) < 0)[:, None, None], faces[:, ::-1], faces)
     triangles = turned + len(ball) * np.arange(len(axes))[:, None, None]
     frames = surface.frame_index[:-1].numpy()
-    joint = np.repeat(np.array(_JOINT_OF_FRAME)[frames], len(ball))
+    joint = np.repeat(np.array(JOINT_OF_FRAME)[frames], len(ball))
     return HandMesh(points.reshape(-1, 3), normals.reshape(-1, 3), joint, triangles.reshape(-1, 3))
 
 

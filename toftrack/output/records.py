@@ -17,7 +17,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -27,13 +27,7 @@ from toftrack.files.safe_files import open_to_read
 from toftrack.frames.estimate import Estimate, is_vacant, no_estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES, JOINT_PARENTS
-from toftrack.output.lines import (
-    FRAME_FIELDS,
-    HAND_FIELDS,
-    KINDS,
-    damaged,
-    read_lines,
-)
+from toftrack.output.lines import FRAME_FIELDS, HAND_FIELDS, KINDS, damaged, read_lines
 
 _PIECE = 256
 """Records that are in memory at a time; a line's numbers take some 10 kB as Python objects."""
@@ -43,7 +37,7 @@ _SOON_S = 2.0
 
 
 class Records:
-    """The frames of a run, for a `with`; each field is a column.
+    """The frames of a run, until `close`; each field is a column.
 
     They are kept in the folder, under no name. latent_size: of the pose space.  slots: of each
     frame; of several, a line has `hands`.
@@ -101,12 +95,6 @@ class Records:
     def close(self) -> None:
         """The records are gone; a second call does nothing."""
         self._file.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def column(self, name: str, rows: np.ndarray | None = None) -> np.ndarray:
         """A whole column, or its rows (not decreasing); texts as texts."""

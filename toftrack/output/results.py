@@ -10,6 +10,7 @@ import datetime
 import json
 import os
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -23,14 +24,7 @@ from toftrack.files.safe_files import write_whole
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
-from toftrack.output.lines import (
-    DROPPED,
-    HAND_FIELDS,
-    KINDS,
-    SHAPES,
-    json_line,
-    strict,
-)
+from toftrack.output.lines import DROPPED, HAND_FIELDS, KINDS, SHAPES, json_line, strict
 from toftrack.output.records import Records, facts_for_readers, write_results
 from toftrack.output.summary import run_doubts, run_metrics, summarise
 
@@ -117,7 +111,7 @@ class ResultWriter:
             return
         self._closed = True
         try:
-            with self._records or records_of(self.folder, self._facts) as records:
+            with closing(self._records or records_of(self.folder, self._facts)) as records:
                 realtime = None if self.realtime is None else self.realtime.summary()
                 self.summary = finish(
                     self.folder, self._facts, self._truth, records, realtime, self.apparent_m

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +63,7 @@ def recover(
     """
     facts = read_run_facts(folder)
     try:
-        with locked_lines(folder), records_of(folder, facts) as records:
+        with locked_lines(folder), closing(records_of(folder, facts)) as records:
             for name in _MADE:
                 check_replaceable(folder / name)
             earlier = read_object(folder / "summary.json")  # of the run itself

@@ -57,26 +57,25 @@ def draw_panel(
     amplitude: np.ndarray | None,
     camera: Camera,
     estimates: Sequence[Estimate],
-    models: Sequence[np.ndarray | None],
-    scale: float,
+    models: Sequence[np.ndarray],
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above the left, frame number, gesture and confidence; above the right, state and score. A red
     caption and frame mark an estimate that is lost, of several hands that all are. The image is the
     amplitude (H, W) in grey, without it depth_m (H, W), nearer brighter; see draw_hands for what is
-    drawn of the slots' estimates. models: of each, (H, W) metres of its surface, or None; nearer is
-    darker, on white, several hands are tinted with their slots' colours. scale: panel pixels per
-    image pixel. Returns (h, w, 3) uint8 BGR, h and w even; the two sides are the halves of w.
+    drawn of the slots' estimates. models: of each, (H, W) metres of its surface, 0 = none; nearer
+    is darker, on white, several hands are tinted with their slots' colours. Returns (h, w, 3) uint8
+    BGR, h and w even; the two sides are the halves of w.
     """
     height, width = depth_m.shape
+    scale = panel_scale(width)
     # Even, so that a video of it can be encoded.
     size = (max(2, 2 * round(width * scale / 2)), max(2, 2 * round(height * scale / 2)))
     grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
     left = _with_hands(grey, amplitude is not None, camera, estimates, size)
-    surfaces = [np.zeros((height, width)) if model is None else model for model in models]
     # Nearest, because mixing the hand with the background would draw a dark rim around it.
-    right = cv2.resize(_model_picture(surfaces), size, interpolation=cv2.INTER_NEAREST)
+    right = cv2.resize(_model_picture(models), size, interpolation=cv2.INTER_NEAREST)
     if all(estimate.lost for estimate in estimates):
         for side in (left, right):
             mark_lost(side)
@@ -133,7 +132,7 @@ def draw_estimates(
         model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
         for estimate, shape in zip(estimates, shapes, strict=True)
     ]
-    return draw_panel(depth_m, amplitude, camera, estimates, models, panel_scale(camera.width))
+    return draw_panel(depth_m, amplitude, camera, estimates, models)
 
 
 class VideoView(View):

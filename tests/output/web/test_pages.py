@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 import pytest
 from helpers.browsing import eventually
-from helpers.chromium import DRAWS_IN_3D, headless_chromium, picture, shown
+from helpers.chromium import DRAWS_IN_3D, headless_chromium
 from helpers.hands import hand_estimate
 from helpers.settings import part
 from helpers.tracking import ROOT
@@ -62,10 +62,23 @@ def select(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
     return picture_of(browser)
 
 
+def shown(browser: Any, reported: str, send: Callable[[], None]) -> Any:
+    """Send until the page says something true in JavaScript, which is returned."""
+
+    def answered() -> Any:
+        send()
+        return browser.execute_script(f"return {reported}")
+
+    return eventually(answered)
+
+
 def picture_of(browser: Any) -> np.ndarray:
+    """(H, W) bool: where something is drawn, between the page's words."""
     # A frame that is asked for is drawn before this is answered.
     browser.execute_async_script("requestAnimationFrame(() => setTimeout(arguments[0], 50))")
-    return picture(browser)
+    data = np.frombuffer(browser.get_screenshot_as_png(), np.uint8)
+    image = cv2.imdecode(data, cv2.IMREAD_COLOR).astype(int)[60:-60]
+    return np.ptp(image, axis=2) > 25  # skin is coloured, the ground is not
 
 
 def test_the_hand_is_drawn_bends_and_becomes_grey_when_it_is_lost(stream: Any, page: Any) -> None:

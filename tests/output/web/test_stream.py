@@ -205,9 +205,3 @@ def test_the_last_lines_arrive_and_then_everything_ends() -> None:
         found = [json.loads(message)["index"] for message in one]
     assert found == list(range(10))
     assert ours() == []
-
-
-def test_a_port_that_is_taken_is_reported(stream: WebSocketStream) -> None:
-    port = urlsplit(stream.url).port
-    with pytest.raises(ToftrackError, match=f"port {port} of 127.0.0.1 is taken.*stream.port=PORT"):
-        websocket_stream(port=port).__enter__()

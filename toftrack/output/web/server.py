@@ -34,6 +34,9 @@ from toftrack.errors import ToftrackError
 from toftrack.files.json_text import parse_json
 
 _log = logging.getLogger(__name__)
+# The terminal belongs to the tracker; a client that breaks off is no error.
+_quiet_log = logging.getLogger(f"{__name__}.clients")
+_quiet_log.setLevel(logging.CRITICAL)
 
 _FIXED_HEADERS = {
     "Cache-Control": "no-store",
@@ -195,7 +198,7 @@ class WebServer:
             max_size=_MOST_RECEIVED_BYTES,
             close_timeout=_CLOSING_S,
             server_header="toftrack",
-            logger=_quiet_log(),
+            logger=_quiet_log,
         )
 
     async def _close(self) -> int:
@@ -346,13 +349,6 @@ def _text(status: int, sentence: str) -> Response:
 def _response(status: int, body: bytes, kind: str) -> Response:
     about = {"Content-Type": f"{kind}; charset=utf-8", "Content-Length": str(len(body))}
     return Response(status, "", Headers(_FIXED_HEADERS | about), body)
-
-
-def _quiet_log() -> logging.Logger:
-    """The terminal belongs to the tracker; a client that breaks off is no error."""
-    log = logging.getLogger(f"{__name__}.clients")
-    log.setLevel(logging.CRITICAL)
-    return log
 
 
 def _refused(group: str, host: str, port: int, error: OSError) -> ToftrackError:

@@ -10,11 +10,9 @@ import torch
 from torch import Tensor
 
 from toftrack.hand.shape import default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import GESTURES, basic_pose
-from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import model_range_image
 from toftrack.views.figures import chart
 from toftrack.views.overlay import range_grey
 
@@ -32,13 +30,10 @@ _NEAR_DEGREES = 15.0
 
 def pose_picture(angles: Tensor, size: int) -> np.ndarray:
     """Range image of an upright hand, nearer is darker: (21,) rad to (size, size) uint8."""
-    shape = default_hand_shape()
     state = torch.cat((torch.tensor([0.0, 0.085, 0.5, -0.25, -0.3, 0.0]), angles.float().cpu()))
-    both = hand_surface(shape).pose(forward_kinematics(state[None], shape))
-    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
     focal = 2.0 * size
-    k = torch.tensor([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
-    return range_grey(render_range_images(hand, k, size, size)[0].numpy())
+    k = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1.0]])
+    return range_grey(model_range_image(state.numpy(), default_hand_shape(), k, size, size))
 
 
 def poses_figure(space: PoseSpace) -> np.ndarray:

@@ -34,14 +34,14 @@ _SAME_SPACE = 0.01
 """Of a coordinate's range: a pose that is encoded elsewhere now is of another space."""
 
 
-def _panel(run: Run, footage: Footage, row: int) -> np.ndarray:
-    """A frame of all slots as the overlay shows it."""
-    images = footage.depth(row), footage.amplitude(row)
-    return draw_estimates(*images, footage.camera, run.estimates(row), run.shapes)
-
-
 def _strip(run: Run, footage: Footage, rows: Iterable[int]) -> np.ndarray:
-    return filmstrip([film_tile(_panel(run, footage, row)) for row in rows])
+    """Frames of all slots as the overlay shows them."""
+    tiles = []
+    for row in rows:
+        images = footage.depth(row), footage.amplitude(row)
+        panel = draw_estimates(*images, footage.camera, run.estimates(row), run.shapes)
+        tiles.append(film_tile(panel))
+    return filmstrip(tiles)
 
 
 def measurement_figure(run: Run, footage: Footage, row: int, of: str) -> np.ndarray:
