@@ -130,24 +130,18 @@ def find_hands(
     return start_finding(finder, depth_m, k, most, least)()
 
 
-@pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.2, -0.1, 0.4), (-0.3, 0.3, 0.3)])
-def test_a_crop_faces_along_the_ray_to_its_centre(centre: tuple[float, float, float]) -> None:
-    rotation = crop_rotation(np.array(centre))
-    assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1)
-    assert rotation[:, 2] == pytest.approx(np.array(centre) / np.linalg.norm(centre))
-
-
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.3, 0.2, 0.4)])
-@pytest.mark.parametrize("up", [(1.0, 0.0, 0.0), (-0.5, 0.7, 0.4), (0.0, -1.0, 0.0)])
-def test_what_is_said_to_be_up_is_up_in_a_crop(
-    centre: tuple[float, float, float], up: tuple[float, float, float]
+@pytest.mark.parametrize("up", [None, (1.0, 0.0, 0.0), (-0.5, 0.7, 0.4), (0.0, -1.0, 0.0)])
+def test_a_crop_faces_its_centre_and_what_is_said_to_be_up_is_up_in_it(
+    centre: tuple[float, float, float], up: tuple[float, float, float] | None
 ) -> None:
-    rotation = crop_rotation(np.array(centre), np.array(up))
+    rotation = crop_rotation(np.array(centre), None if up is None else np.array(up))
     assert rotation @ rotation.T == pytest.approx(np.eye(3), abs=1e-12)
     assert rotation[:, 2] == pytest.approx(np.array(centre) / np.linalg.norm(centre))
-    across, down, _ = np.array(up) @ rotation
-    assert across == pytest.approx(0, abs=1e-12) and down < 0
+    assert np.linalg.det(rotation) == pytest.approx(1)
+    if up is not None:
+        across, down, _ = np.array(up) @ rotation
+        assert across == pytest.approx(0, abs=1e-12) and down < 0
 
 
 def test_a_crop_shows_depths_about_its_centre() -> None:
@@ -341,13 +335,3 @@ def test_centres_at_the_border_and_beyond_it(centre: tuple[float, float, float])
     assert np.isfinite(image).all()
     if abs(centre[0]) > 1:
         assert (image[2] == 1).all(), "nothing is read there"
-
-
-def test_the_hypotheses_are_sorted_and_within_what_a_hand_can() -> None:
-    pose, _ = small_networks()
-    seen = run_pose_network(
-        pose, sample().depth_m[0], sample().k, sample().joints_m[0, [9]], "right"
-    )
-    assert (seen.log_probability.diff(dim=1) <= 0).all()
-    assert 0 < float(seen.log_probability.exp().sum()) < 1 + 1e-5
-    assert (seen.error_m > 0).all() and (seen.sigma_m > 0).all()

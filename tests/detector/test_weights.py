@@ -102,13 +102,6 @@ def test_a_damaged_byte_anywhere_is_an_error_of_ours_or_harmless(file: Path) -> 
             assert str(file) in str(error)
 
 
-@pytest.mark.parametrize("part", [0.0, 0.3, 0.999])
-def test_a_file_that_is_cut_off(file: Path, part: float) -> None:
-    content = file.read_bytes()
-    file.write_bytes(content[: int(part * len(content))])
-    refused(file, "is no file of the detector's weights")
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -124,11 +117,12 @@ def test_weights_that_say_that_they_are_others_are_refused(
     refused(file, words)
 
 
-def test_what_is_no_archive(tmp_path: Path) -> None:
-    refused(tmp_path / "gone.npz", "there are no weights of the detector at")
-    path = tmp_path / "weights.npz"
-    path.write_text("weights")
-    refused(path, "is no file of the detector's weights")
+def test_what_is_no_archive_or_cut_off(file: Path) -> None:
+    path, content = file, file.read_bytes()
+    refused(path.with_name("gone.npz"), "there are no weights of the detector at")
+    for part in (b"weights", *(content[: int(part * len(content))] for part in (0.0, 0.3, 0.999))):
+        path.write_bytes(part)
+        refused(path, "is no file of the detector's weights")
     with path.open("wb") as stream:
         np.save(stream, np.zeros(3))
     refused(path, "is no file of the detector's weights")

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 
+import numba
 import numpy as np
 import torch
 from helpers.settings import detector_settings
@@ -25,7 +26,7 @@ from toftrack.training.hands import HAND, Hands, posed_hands
 from toftrack.training.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.training.scenes import Scenes
 from toftrack.training.shapes import ShapeBank, shape_bank
-from toftrack.training.things_numba import PART
+from toftrack.training.things_numba import PART, part_distance
 
 FARTHEST_M = 7.9
 """Nothing is drawn beyond 8 m."""
@@ -33,6 +34,12 @@ FARTHEST_M = 7.9
 
 def dice(seed: int = 0) -> Dice:
     return Dice(torch.Generator().manual_seed(seed))
+
+
+@numba.njit
+def distance_to(part, point):
+    """From a point (3,) to a thing's part (PART,)."""
+    return part_distance(part, point[0], point[1], point[2])
 
 
 @cache

@@ -7,30 +7,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers.detection import used
 
-from toftrack.detector.crops import CROP_CHANNELS
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import load_weights, save_weights
+from toftrack.detector.weights import save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from, save
 
 pytestmark = pytest.mark.usefixtures("one_thread")
-
-CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
-
-
-@pytest.fixture(scope="module")
-def network() -> PoseNet:
-    torch.manual_seed(1)
-    return used(PoseNet(4), CROPS)
-
-
-@pytest.fixture
-def file(network: PoseNet, tmp_path: Path) -> Path:
-    path = tmp_path / "weights.npz"
-    save_weights(path, network, Finder(8), {})
-    return path
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
@@ -54,21 +37,12 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
         Checkpoints(tmp_path, 1.0, resume=tmp_path / "gone").restore("poses", progress, {})
 
 
-def test_training_goes_on_from_the_weights_of_a_file(network: PoseNet, file: Path) -> None:
-    going_on = PoseNet(4)
+def test_training_goes_on_from_the_weights_of_a_file(tmp_path: Path) -> None:
+    network, going_on, file = PoseNet(4), PoseNet(4), tmp_path / "weights.npz"
+    save_weights(file, network, Finder(8), {})
     go_on_from(file, "pose", going_on, 4)
     for name, value in network.state_dict().items():
-        torch.testing.assert_close(going_on.state_dict()[name], value)
-    with pytest.raises(ToftrackError, match="width of 8, and the width to train is 6"):
-        go_on_from(file, "finder", Finder(6), 6)
-
-
-@torch.no_grad()
-def test_training_of_a_wider_network_begins_with_what_the_narrower_one_says(file: Path) -> None:
-    wider = PoseNet(7).train()
-    go_on_from(file, "pose", wider, 7)
-    narrow, *_ = load_weights(file)
-    for one, two in zip(narrow.features(CROPS), wider.eval().features(CROPS), strict=True):
-        torch.testing.assert_close(two, one, atol=1e-4, rtol=1e-4)
-    seeing = wider.fine.first.weight[8:]
-    assert (seeing[:, :4] != 0).all()  # the new channels see the old ones
+        torch.testing.assert_close(going_on.state_dict()[name], value, atol=1e-3, rtol=1e-3)
+    for width in (6, 10):
+        with pytest.raises(ToftrackError, match=f"width of 8, and the width to train is {width}"):
+            go_on_from(file, "finder", Finder(width), width)

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,6 +32,22 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
 
 
+@pytest.fixture
+def folders(tmp_path: Path) -> Callable[[str], Path]:
+    """New ones, by their names."""
+
+    def made(name: str) -> Path:
+        (tmp_path / name).mkdir()
+        return tmp_path / name
+
+    return made
+
+
+def same(one: torch.nn.Module, two: torch.nn.Module) -> None:
+    for key, value in one.state_dict().items():
+        assert torch.equal(value, two.state_dict()[key]), key
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("train", [train_poses, train_finder])
 def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,8 +55,7 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
     one, other = (train(TINY, 6, seed) for seed in (0, 1))
     monkeypatch.setattr(batches, "threads", lambda: 2)
     two = train(TINY, 6, 0)
-    for key, value in one[0].state_dict().items():
-        assert torch.equal(value, two[0].state_dict()[key]), key
+    same(one[0], two[0])
     weights = [network.state_dict()["heads.weight"] for network, _ in (one, other)]
     assert not torch.equal(*weights)
     assert one[1][-1]["images"] == 24 and len(one[1]) == 1
@@ -50,8 +66,6 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
     [
         ({"images": 0}, "images of a network must be a whole number above 0"),
         ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
-        ({"start": "w.npz", "start_share": 1.0}, "start_share of a network must be at least 0"),
-        ({"start_share": 0.5}, "start_share of a network needs weights to start from"),
     ],
 )
 def test_a_schedule_that_cannot_be_is_refused(change: dict, words: str) -> None:
@@ -72,57 +86,23 @@ def test_no_images_leave_the_weights_of_a_start_as_they_are(tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_share_of_the_start_makes_the_mean_of_both(tmp_path: Path) -> None:
-    torch.manual_seed(0)
-    begun = Finder(4)
-    save_weights(tmp_path / "w.npz", PoseNet(4), begun, {})
-    schedule = Schedule(24, 8, 0.002, 4, str(tmp_path / "w.npz"))
-    trained, _ = train_finder(schedule, shapes=6, seed=0)
-    mean, _ = train_finder(replace(schedule, start_share=0.25), shapes=6, seed=0)
-    start, end = begun.state_dict(), trained.state_dict()
-    for key, value in mean.state_dict().items():
-        if value.is_floating_point():
-            torch.testing.assert_close(
-                value, 0.25 * start[key] + 0.75 * end[key], atol=1e-3, rtol=1e-3
-            )
-
-
-@pytest.mark.slow
 def test_a_restart_ends_with_the_mean_of_both_ends(tmp_path: Path) -> None:
     """As two trainings do, of which the second begins from the first one's weights."""
     first, before = train_finder(TINY, 6, 0)
     save_weights(tmp_path / "w.npz", PoseNet(4), first, {})
-    begun = {"start": str(tmp_path / "w.npz"), "start_share": 0.5}
-    second, _ = train_finder(replace(TINY, rate=0.001, **begun), 6, descent._RESTART_SEED)
+    again = replace(TINY, rate=0.001, start=str(tmp_path / "w.npz"))
+    second, _ = train_finder(again, 6, descent._RESTART_SEED)
     schedule = replace(TINY, restart_images=24, restart_rate=0.001)
     both, course = train_finder(schedule, 6, 0)
     moved = 0.0
     for key, value in both.state_dict().items():
         if value.is_floating_point():
-            end = second.state_dict()[key]
-            torch.testing.assert_close(value, end, atol=1e-3, rtol=1e-3)
-            moved = max(moved, float((value - first.state_dict()[key]).abs().max()))
+            begun, end = first.state_dict()[key], second.state_dict()[key]
+            torch.testing.assert_close(value, (begun + end) / 2, atol=1e-3, rtol=1e-3)
+            moved = max(moved, float((value - begun).abs().max()))
     assert moved > 0.002
     assert [row["images"] for row in course] == [24, 48]
     assert course[0]["loss"] == before[0]["loss"] and course[1]["seconds"] > course[0]["seconds"]
-
-
-@pytest.mark.slow
-def test_a_restart_that_was_interrupted_ends_with_the_same_weights(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("whole", "first", "part", "rest"):
-        (tmp_path / name).mkdir()
-    schedule = replace(TINY, restart_images=24)
-    whole, course = train_finder(schedule, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
-    train_finder(TINY, 6, 0, Checkpoints(tmp_path / "first", 1.0))
-    resumed = Checkpoints(tmp_path / "part", 1e-9, resume=tmp_path / "first")
-    interrupted(train_finder, resumed, monkeypatch, after=2, schedule=schedule)
-    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "part")
-    rest, other = train_finder(schedule, 6, 0, resumed)
-    for key, value in whole.state_dict().items():
-        assert torch.equal(value, rest.state_dict()[key]), key
-    assert [row["loss"] for row in course] == [row["loss"] for row in other]
 
 
 def noise(n: int, _: ShapeBank, generator: torch.Generator) -> images.WideImages:
@@ -201,21 +181,23 @@ class SwitchedOffError(Exception):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("train", [train_poses, train_finder])
-def test_an_interrupted_training_ends_with_the_same_weights(
-    train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_training_that_was_interrupted_twice_ends_with_the_same_weights(
+    train, folders: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for name in ("whole", "part", "rest", "end"):
-        (tmp_path / name).mkdir()
-    whole, course = train(TINY, 6, 0, Checkpoints(tmp_path / "whole", 1e-9))
-    interrupted(train, Checkpoints(tmp_path / "part", 1e-9), monkeypatch, after=2)
-    again = Checkpoints(tmp_path / "rest", 1e-9, resume=tmp_path / "part")
-    rest, other = train(TINY, 6, 0, again)
-    for key, value in whole.state_dict().items():
-        assert torch.equal(value, rest.state_dict()[key]), key
-    errors = [{k: v for k, v in row.items() if k != "seconds"} for row in (course[-1], other[-1])]
-    assert errors[0] == errors[1]
-    done, _ = train(TINY, 6, 0, Checkpoints(tmp_path / "end", 1e-9, resume=tmp_path / "rest"))
-    assert torch.equal(done.state_dict()["heads.weight"], rest.state_dict()["heads.weight"])
+    """Before its restart and in it."""
+    schedule = replace(TINY, restart_images=24)
+    whole, course = train(schedule, 6, 0, Checkpoints(folders("whole"), 1e-9))
+    part = Checkpoints(folders("part"), 1e-9)
+    interrupted(train, part, monkeypatch, after=2, schedule=schedule)
+    more = Checkpoints(folders("more"), 1e-9, resume=part.folder)
+    interrupted(train, more, monkeypatch, after=2, schedule=schedule)
+    again = Checkpoints(folders("rest"), 1e-9, resume=more.folder)
+    rest, other = train(schedule, 6, 0, again)
+    same(whole, rest)
+    one, two = ([row | {"seconds": 0} for row in rows] for rows in (course, other))
+    assert one == two and len(one) == 2
+    done, _ = train(schedule, 6, 0, Checkpoints(folders("end"), 1e-9, resume=again.folder))
+    same(done, rest)
 
 
 def interrupted(
@@ -241,20 +223,17 @@ def interrupted(
 
 @pytest.mark.slow
 def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    folders: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(descent, "_WARM", 1)
-    for name in ("whole", "early", "late", "rest"):
-        (tmp_path / name).mkdir()
     more_images = replace(TINY, images=48)
-    whole, _ = train_finder(more_images, 6, 0, Checkpoints(tmp_path / "whole", 1.0))
-    interrupted(train_finder, Checkpoints(tmp_path / "early", 1e-9), monkeypatch, after=1)
-    resumed = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "early")
+    whole, _ = train_finder(more_images, 6, 0)
+    early, late = (Checkpoints(folders(name), 1e-9) for name in ("early", "late"))
+    interrupted(train_finder, early, monkeypatch, after=1)
+    resumed = Checkpoints(folders("rest"), 1.0, resume=early.folder)
     rest, course = train_finder(more_images, 6, 0, resumed)
     assert course[-1]["images"] == 48
-    for key, value in whole.state_dict().items():
-        assert torch.equal(value, rest.state_dict()[key]), key
-    interrupted(train_finder, Checkpoints(tmp_path / "late", 1e-9), monkeypatch, after=3)
-    late = Checkpoints(tmp_path / "rest", 1.0, resume=tmp_path / "late")
+    same(whole, rest)
+    interrupted(train_finder, late, monkeypatch, after=3)
     with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
-        train_finder(more_images, 6, 0, late)
+        train_finder(more_images, 6, 0, replace(resumed, resume=late.folder))

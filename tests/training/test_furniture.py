@@ -2,31 +2,25 @@
 
 from __future__ import annotations
 
-import numba
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from helpers.detection import clean_picture, dice, distance_to, intrinsics, plain_scenes
 
-from toftrack.training.dice import Dice
 from toftrack.training.furniture import PIECES, before_camera, frames, furniture, on_a_piece
 from toftrack.training.hands import HAND, OTHER_HAND
-from toftrack.training.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
-from toftrack.training.scenes import Scenes
-from toftrack.training.things_numba import BALL, BOX, CONE, PART, part_distance
+from toftrack.training.things_numba import BALL, BOX, CONE, PART
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 N = 64
 
 
-@numba.njit
-def distance_to(part, point):
-    return part_distance(part, point[0], point[1], point[2])
-
-
 def pieces(there: torch.Tensor, seed: int = 0) -> torch.Tensor:
-    dice = Dice(torch.Generator().manual_seed(seed))
-    return furniture(there, before_camera(len(there), dice), dice)
+    own = dice(seed)
+    return furniture(there, before_camera(len(there), own), own)
 
 
 def test_where_there_is_furniture_there_are_two_pieces_or_more() -> None:
@@ -51,7 +45,7 @@ def test_pieces_stand_together() -> None:
 
 def test_a_place_on_a_piece_is_in_it_or_nearly() -> None:
     made = pieces(torch.ones(N, dtype=torch.bool))
-    places = on_a_piece(made, Dice(torch.Generator().manual_seed(0))).numpy()
+    places = on_a_piece(made, dice()).numpy()
     some = [[part for part in row.numpy().astype(np.float64) if part[0] >= 0] for row in made]
     away = [
         min(distance_to(part, place) for part in row)
@@ -61,31 +55,18 @@ def test_a_place_on_a_piece_is_in_it_or_nearly() -> None:
 
 
 def test_it_is_seen_and_is_no_hand() -> None:
-    n = N
-    none = torch.zeros(n, 1, dtype=torch.long) - 1
-    scenes = Scenes(
-        torch.zeros(n, 1, 3),
-        torch.eye(3).expand(n, 1, 3, 3),
-        none,
-        torch.tensor([0.0, 0.0, 1.0, torch.inf]).expand(n, 1, 4),
-        torch.zeros_like(none, dtype=torch.bool),
-        (),
-        pieces(torch.ones(n, dtype=torch.bool)),
-    )
-    lens = Lens(*(torch.full((n,), value) for value in (100.0, 48.0, 40.0, 96.0, 80.0)))
-    sensors = torch.zeros(n, SENSOR_TERMS)
-    sensors[:, RANGE] = 9.0
-    depth, labels = take_pictures(
-        scenes, lens, sensors, (80, 96), Dice(torch.Generator().manual_seed(0))
-    )
-    seen = (depth > 0).reshape(n, -1).sum(1)
+    none = torch.zeros(N, 1, 3), torch.eye(3).expand(N, 1, 3, 3), torch.full((N, 1), -1)
+    empty = plain_scenes(*none, torch.tensor([0.0, 0.0, 1.0, torch.inf]).expand(N, 1, 4))
+    scenes = replace(empty, parts=pieces(torch.ones(N, dtype=torch.bool)))
+    depth, labels = clean_picture(scenes, intrinsics(100.0, 80, 96), 80, 96)
+    seen = (depth > 0).reshape(N, -1).sum(1)
     assert (seen > 30).mean() > 0.8 and depth[depth > 0].min() > 0.05
     assert not ((labels == HAND) | (labels == OTHER_HAND)).any()
 
 
 def test_slats_of_a_frame_lie_in_one_plane_and_cross_at_right_angles() -> None:
     middle = torch.tensor([[0.0, 0.0, 0.8]]).expand(N, 3)
-    slats = frames(middle, Dice(torch.Generator().manual_seed(0)))
+    slats = frames(middle, dice())
     rows = slats[..., 4:13].unflatten(-1, (3, 3))
     long, normal = rows[:, :, 1], rows[:, :1, 2]
     off = ((slats[..., 1:4] - middle[:, None]) * normal).sum(-1).abs()

@@ -4,27 +4,28 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 import torch
-from helpers.detection import clean_picture, dice, intrinsics, plain_scenes, small_bank
+from helpers.detection import (
+    clean_picture,
+    dice,
+    distance_to,
+    intrinsics,
+    plain_scenes,
+    small_bank,
+)
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.training import hands as module
 from toftrack.training.hands import HAND, THING, Grasps, posed_hands, random_grasps
 from toftrack.training.held_things import _PHONE_M
-from toftrack.training.things_numba import BALL, BOX, CONE, RING, part_distance
+from toftrack.training.things_numba import BALL, BOX, CONE, RING
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 N = 300
-
-
-@numba.njit
-def distance_to(part, point):
-    return part_distance(part, point[0], point[1], point[2])
 
 
 def grasps(seed: int = 0) -> tuple[Grasps, HandShape]:

@@ -157,7 +157,7 @@ def test_a_quarter_turn_of_a_crop_is_one_of_what_is_read_and_not_of_where_the_im
         read_pictures(depth, labels, sides, distance, torch.tensor([angle]), border)[0].numpy()
         for angle in (0.0, math.pi / 2)
     )
-    # What was to the right is up: upright_angle of (1, 0).
+    # What was to the right is up.
     np.testing.assert_allclose(turned[0, :4], np.rot90(held[0, :4], 1, (1, 2)), atol=1e-5)
     assert held[0, 3, :, -5:].min() == 1 and turned[0, 3, :5].min() == 1
 

@@ -39,14 +39,10 @@ def crop_rotation(centre_m: np.ndarray, up: np.ndarray | None = None) -> np.ndar
     if up is None:
         return upright
     across, down, _ = up @ upright
-    angle = upright_angle(float(across), float(down))
+    # By how much a crop is turned about its z axis so that this direction, x and y, is up.
+    angle = math.atan2(across, -down) if across or down else 0.0
     c, s = math.cos(angle), math.sin(angle)
     return upright @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def upright_angle(across: float, down: float) -> float:
-    """By how much a crop is turned about its z axis so that a direction in it, x and y, is up."""
-    return math.atan2(across, -down) if across or down else 0.0
 
 
 def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:

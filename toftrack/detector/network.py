@@ -23,9 +23,7 @@ from toftrack.detector.crops import CROP_CHANNELS, CROP_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 SEGMENTS = 5
-"""Background, the hand, its forearm, another hand or forearm, things. Weights of before things had
-a class of their own know the first four.
-"""
+"""Background, the hand, its forearm, another hand or forearm, things."""
 PARTS = 32
 """Side of the picture of parts that the pose network also learns."""
 STRIDE = 4

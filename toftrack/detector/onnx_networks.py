@@ -30,7 +30,7 @@ VERSION = "3"
 DIGEST = 64
 """Last bytes of such a file, the SHA-256 in hexadecimal of all before: a property's value."""
 FLOAT, WHOLE = "float32", "int8"
-"""Precisions that such a file says it is in; one that says nothing is of before there were two."""
+"""Precisions that such a file says it is in."""
 COMMAND = "python -m toftrack.training export"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)

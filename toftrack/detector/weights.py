@@ -49,12 +49,11 @@ def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any
 
 
 class Weights(NamedTuple):
-    """Both networks ready for use, how they were trained, their file, its arrays' checksum."""
+    """Both networks ready for use, how they were trained, their arrays' checksum."""
 
     pose: PoseNet
     finder: Finder
     about: dict[str, Any]
-    path: Path
     sha256: str
 
 
@@ -72,7 +71,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
             network.load_state_dict(network_tensors(arrays, name))
     make_ready(pose)
     make_ready(finder)
-    return Weights(pose, finder, metadata.get("about", {}), path, metadata["sha256"])
+    return Weights(pose, finder, metadata.get("about", {}), metadata["sha256"])
 
 
 def weights_file(path: str | Path | None = None) -> Path:

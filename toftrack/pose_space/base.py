@@ -6,10 +6,12 @@ import functools
 from dataclasses import dataclass, fields, replace
 from typing import Any, ClassVar, Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from toftrack.compute.transfer import table
+from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 
@@ -72,6 +74,24 @@ def clamp_to_joint_limits(angles: Tensor) -> Tensor:
 def _limits(device: torch.device, dtype: torch.dtype) -> tuple[Tensor, ...]:
     """The lower and the upper joint limits, each (21,)."""
     return table(ANGLE_LIMITS, dtype, device).T.contiguous().unbind(0)
+
+
+def check_dims(dims: int, poses: int, most: int) -> None:
+    """ToftrackError where so many poses do not make a space of `dims` dimensions."""
+    if not 1 <= dims <= most:
+        raise ToftrackError(
+            f"pose_space.dims={dims} cannot be learned from {poses} poses; give 1 to {most}"
+        )
+
+
+def signed(columns: np.ndarray) -> np.ndarray:
+    """Coordinates (M, d), whose signs are arbitrary, with the largest entry of each positive."""
+    return columns * np.sign(columns[np.abs(columns).argmax(0), np.arange(columns.shape[1])])
+
+
+def tensor32(array: np.ndarray | float) -> Tensor:
+    """A float32 tensor with its own memory."""
+    return torch.tensor(np.asarray(array), dtype=torch.float32)
 
 
 def clamped_share(space: PoseSpace, latent: Tensor) -> float:

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError
-from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.base import PoseSpace, check_dims, signed, tensor32
 
 # Widths of the map's kernel in parts of the median distance between training latents, and ridges
 # relative to a kernel's value of 1. All pairs are tried.
@@ -110,11 +110,6 @@ def _regression(latents: np.ndarray, angles: np.ndarray) -> tuple[float, dict[st
     }
 
 
-def tensor32(array: np.ndarray | float) -> Tensor:
-    """A float32 tensor with its own memory."""
-    return torch.tensor(np.asarray(array), dtype=torch.float32)
-
-
 def _squared_distances(points: np.ndarray) -> np.ndarray:
     return np.square(points[:, None] - points[None]).sum(-1)
 
@@ -132,11 +127,6 @@ def _line(latents: np.ndarray, angles: np.ndarray) -> tuple[np.ndarray, np.ndarr
     """Design matrix (M, 1 + d) and the least-squares line (1 + d, 21)."""
     design = _design(latents)
     return design, np.linalg.lstsq(design, angles, rcond=None)[0]
-
-
-def _signed(columns: np.ndarray) -> np.ndarray:
-    """Coordinates (M, d), whose signs are arbitrary, with the largest entry of each positive."""
-    return columns * np.sign(columns[np.abs(columns).argmax(0), np.arange(columns.shape[1])])
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +164,7 @@ def fit_kernel_pca(
     import sklearn.decomposition  # here, as it takes a while, and the linear space needs none
 
     x = angles.double().cpu().numpy()
-    _check_dims(dims, x, len(x) - 1)
+    check_dims(dims, len(x), len(x) - 1)
     if gamma is not None and gamma <= 0:
         raise ToftrackError(f"pose_space.gamma={gamma} must be above 0, in 1 / rad^2, or null")
     square = _squared_distances(x)
@@ -186,7 +176,7 @@ def fit_kernel_pca(
         ).fit(x)
         if model.eigenvalues_.shape[0] < dims or model.eigenvalues_[-1] < 1e-10:
             continue
-        vectors = _signed(model.eigenvectors_)
+        vectors = signed(model.eigenvectors_)
         # In this unit the coordinates are those of PCA, in radians, when the kernel is wide.
         unit = 1 / np.sqrt(2 * candidate)
         error_rad, found = _regression(unit * vectors * np.sqrt(model.eigenvalues_), x)
@@ -205,13 +195,6 @@ def fit_kernel_pca(
         projection=tensor32(projection),
         shift=tensor32(-np.exp(-chosen * square).mean(0) @ projection),
     )
-
-
-def _check_dims(dims: int, poses: np.ndarray, most: int) -> None:
-    if not 1 <= dims <= most:
-        raise ToftrackError(
-            f"pose_space.dims={dims} cannot be learned from {len(poses)} poses; give 1 to {most}"
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -301,7 +284,7 @@ def _fit_neighbours(
     """
     x = angles.double().cpu().numpy()
     most = len(x) - 1
-    _check_dims(dims, x, min(most - 1, x.shape[1]))
+    check_dims(dims, len(x), min(most - 1, x.shape[1]))
     if neighbours is not None and not dims < neighbours <= most:
         raise ToftrackError(
             f"pose_space.neighbours={neighbours} must be above the {dims} dimensions and at most"
@@ -311,7 +294,7 @@ def _fit_neighbours(
     for number in (
         (neighbours,) if neighbours else sorted({min(max(k, dims + 1), most) for k in tried})
     ):
-        fits.append((*_regression(_signed(embed(x, number)), x), number))
+        fits.append((*_regression(signed(embed(x, number)), x), number))
     _, found, number = min(fits, key=lambda fit: fit[0])
     return space(**found, training_labels=labels, neighbours=tensor32(number))
 

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
-from toftrack.pose_space.base import PoseSpace
+from toftrack.pose_space.base import PoseSpace, check_dims, signed, tensor32
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,25 +35,18 @@ class PCAPoseSpace(PoseSpace):
 
 def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSpace:
     """Principal components of (M, 21) training poses; float32 on the CPU."""
-    if not 1 <= dims <= min(angles.shape):
-        raise ToftrackError(
-            f"pose_space.dims={dims} cannot be learned from {angles.shape[0]} poses of"
-            f" {angles.shape[1]} angles; give 1 to {min(angles.shape)}"
-        )
+    check_dims(dims, len(angles), min(angles.shape))
     x = angles.double().cpu().numpy()
     mean = x.mean(0)
     _, singular, rows = np.linalg.svd(x - mean, full_matrices=False)
-    # The sign of a component is no one's: its largest entry is positive, as scikit-learn has it.
-    largest = np.abs(rows).argmax(1)
-    rows = rows * np.sign(rows[np.arange(len(rows)), largest])[:, None]
-    components = rows[:dims]
+    components = signed(rows.T).T[:dims]
     latents = (x - mean) @ components.T
     return PCAPoseSpace(
-        mean=torch.from_numpy(mean).float(),
-        components=torch.from_numpy(components.copy()).float(),
-        explained_variance_ratio=torch.from_numpy(singular**2 / (singular**2).sum()).float(),
-        lower=torch.from_numpy(latents.min(0)).float(),
-        upper=torch.from_numpy(latents.max(0)).float(),
-        training_latents=torch.from_numpy(latents).float(),
+        mean=tensor32(mean),
+        components=tensor32(components),
+        explained_variance_ratio=tensor32(singular**2 / (singular**2).sum()),
+        lower=tensor32(latents.min(0)),
+        upper=tensor32(latents.max(0)),
+        training_latents=tensor32(latents),
         training_labels=labels,
     )

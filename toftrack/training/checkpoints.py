@@ -143,35 +143,16 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
 def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:
     """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
 
-    A wider network's further channels begin without effect on what is there (as Chen et al.,
-    "Net2Net: accelerating learning via knowledge transfer", ICLR 2016, with new channels instead
-    of copies).
-    Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for a
-    narrower network.
+    Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for
+    weights of another width.
     """
     path = Path(path)
     arrays, metadata = read_arrays(path)
     with other_networks_refused(path):
-        before, tensors = network_width(metadata, name), network_tensors(arrays, name)
-        if before > width:
+        if (before := network_width(metadata, name)) != width:
             raise ToftrackError(
                 f"{path} holds weights for a width of {before}, and the width to train is {width};"
-                " give that width or more"
+                " give the same"
             )
-        network.load_state_dict(_widened(tensors, network.state_dict()))
+        network.load_state_dict(network_tensors(arrays, name))
     return str(metadata["sha256"])
-
-
-def _widened(tensors: dict[str, Tensor], fresh: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of a network in one that has more channels, whose own are `fresh`.
-
-    The new channels see all others, and none of those that were there sees them, at first.
-    """
-    widened = {}
-    for key, new in fresh.items():
-        old, out = tensors[key], new.clone()
-        if old.ndim > 1 and old.is_floating_point():
-            out[: len(old)] = 0
-        out[tuple(slice(size) for size in old.shape)] = old
-        widened[key] = out
-    return widened

@@ -33,12 +33,7 @@ from toftrack.detector.weights import checksum
 from toftrack.errors import ToftrackError
 from toftrack.training.batches import Batches, keep_memory, made_batches, makers, makers_watched
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
-from toftrack.training.images import (
-    Crops,
-    WideImages,
-    crop_images,
-    wide_images,
-)
+from toftrack.training.images import Crops, WideImages, crop_images, wide_images
 from toftrack.training.losses import finder_loss, pose_losses
 from toftrack.training.muon import Muon, half_precision
 
@@ -64,9 +59,6 @@ class Schedule:
     batch: images of a step.  rate: the highest learning rate, see rate_at.
     width: channels of the network's first layer.
     start: a file of weights to go on from; None begins from nothing.
-    start_share: of these weights in the result, which is the mean of both, weight by weight: what
-        the start knew of images unlike those it now learns from is kept so (Wortsman et al.,
-        "Robust fine-tuning of zero-shot models", CVPR 2022).
     restart_images: seen after `images`, while the rate rises again and falls; the result is the
         mean of both ends; 0 = no restart.  restart_rate: the highest learning rate meanwhile.
     """
@@ -76,7 +68,6 @@ class Schedule:
     rate: float
     width: int
     start: str | None = None
-    start_share: float = 0.0
     restart_images: int = 0
     restart_rate: float = 0.0012
 
@@ -91,12 +82,6 @@ class Schedule:
         for name in ("rate", "restart_rate"):
             if not 0 < getattr(self, name) < 1:
                 raise ToftrackError(f"{name} of a network must be between 0 and 1")
-        if not 0 <= self.start_share < 1:
-            raise ToftrackError("start_share of a network must be at least 0 and less than 1")
-        if self.start_share > 0 and self.start is None:
-            raise ToftrackError(
-                "start_share of a network needs weights to start from: give start, too, or 0"
-            )
 
     @property
     def steps(self) -> int:
@@ -187,12 +172,6 @@ class Task:
     losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
     replayed: bool = False
 
-    @property
-    def counted(self) -> str:
-        """The setting that says how many images it sees."""
-        network, _, restart = self.name.partition("_")
-        return f"{network}.{restart and 'restart_'}images"
-
 
 class _Step:
     """One step of a training: losses, gradients, new weights and their average."""
@@ -259,19 +238,20 @@ def _train(
         kind = "pose" if isinstance(network, PoseNet) else "finder"
         start = go_on_from(schedule.start, kind, network, schedule.width)
     where = (shapes, checkpoints, device)
-    course = _descend(network, task, schedule, seed, start, schedule.start_share, *where)
+    course = _descend(network, task, schedule, seed, start, *where)
     if schedule.restart_images > 0 and schedule.images > 0:
-        before = course[-1]
+        before, first = course[-1], deepcopy(network)
         restart = replace(
             schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
         )
         task = replace(task, name=f"{task.name}_restart")
         begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
         seed += _RESTART_SEED
-        for row in _descend(network, task, restart, seed, begun, _RESTART_SHARE, *where):
+        for row in _descend(network, task, restart, seed, begun, *where):
             images = before["images"] + row["images"]
             seconds = round(before["seconds"] + row["seconds"], 1)
             course.append(row | {"images": images, "seconds": seconds})
+        _average(network, first, torch.tensor(_RESTART_SHARE, device=device))
     return network.cpu(), course
 
 
@@ -281,7 +261,6 @@ def _descend(
     schedule: Schedule,
     seed: int,
     start: str | None,
-    start_share: float,
     shapes: int,
     checkpoints: Checkpoints | None,
     device: torch.device,
@@ -290,18 +269,17 @@ def _descend(
     weights.
 
     start: the checksum of the weights that it comes with; None = they are random.
-    start_share: of these weights in the result.
     """
     steps = schedule.steps
     network.train().to(device, memory_format=torch.channels_last)
-    begun, averaged = deepcopy(network), deepcopy(network)
+    averaged = deepcopy(network)
     optimiser = Muon(network, network.ends, schedule.rate, _DECAY)
     progress = Progress(network, averaged, optimiser, schedule.images)
     settings: dict[str, Any] = {"batch": schedule.batch, "rate": schedule.rate}
     settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
     if checkpoints is not None:
         checkpoints.restore(task.name, progress, settings)
-        _check_length(task.counted, progress, schedule)
+        _check_length(task.name, progress, schedule)
     course = progress.course
     before, began = progress.seconds, time.perf_counter()
     images = steps * schedule.batch
@@ -327,17 +305,17 @@ def _descend(
                 checkpoints.write(task.name, progress, settings)
     if checkpoints is not None:
         checkpoints.write(task.name, progress, settings, now=True)
-    if start_share > 0:
-        _average(averaged, begun, torch.tensor(start_share, device=device))
     network.load_state_dict(averaged.state_dict())
     return course
 
 
-def _check_length(counted: str, progress: Progress, schedule: Schedule) -> None:
+def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
     """A training that goes on may end elsewhere than was meant, if neither would have begun to end.
 
-    counted: the setting that says how many images it sees. Raises ToftrackError.
+    name: of the task. Raises ToftrackError.
     """
+    network, _, restart = name.partition("_")
+    counted = f"{network}.{restart and 'restart_'}images"
     meant = replace(schedule, images=progress.images)
     if meant.steps != schedule.steps and progress.step > _STEADY * min(meant.steps, schedule.steps):
         raise ToftrackError(

@@ -17,6 +17,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -77,12 +78,14 @@ def quantised(model: Any, images: np.ndarray) -> Any:
     import onnx
     from onnxruntime.quantization import CalibrationMethod, QuantFormat, QuantType, quantize_static
 
+    name, starts = model.graph.input[0].name, range(0, len(images), _BATCH)
+    batches = iter([{name: images[start : start + _BATCH]} for start in starts])
     with _quiet(), tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "quantised.onnx"
         quantize_static(
             model,
             str(file),
-            _Images(model.graph.input[0].name, images),
+            SimpleNamespace(get_next=lambda: next(batches, None)),  # a CalibrationDataReader
             # Of separate operators, which ONNX Runtime joins as suits the processor.
             quant_format=QuantFormat.QDQ,
             per_channel=True,
@@ -140,15 +143,6 @@ def _kept(model: Any) -> list[str]:
         if last or dense or given.intersection(node.input):
             kept.append(node.name)
     return kept
-
-
-class _Images:
-    """What onnxruntime.quantization reads: a CalibrationDataReader."""
-
-    def __init__(self, name: str, images: np.ndarray) -> None:
-        starts = range(0, len(images), _BATCH)
-        batches = iter([{name: images[start : start + _BATCH]} for start in starts])
-        self.get_next = lambda: next(batches, None)
 
 
 _OPSET, _IR = 18, 10

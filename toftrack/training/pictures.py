@@ -372,7 +372,7 @@ def read_pictures(
 
     depth, labels: (N, H, W) of side (N, 2) int32 pixels: of the picture and, in its middle, of the
     crop.  distance_m: (N,) of the crops' centres.  turn: (N,) by how much crops are turned about
-    their centres, radians, see crops.upright_angle.
+    their centres, radians, as crops.crop_rotation turns them.
     border: (N, 2, 3) what is in the image, a x + b y < c for x, y in -0.5 .. 0.5 across the crop as
     it were without its turn; parts beyond are -1, and nothing is read there.
     """

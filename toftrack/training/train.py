@@ -72,7 +72,6 @@ def train(config: DictConfig) -> float:
     for name, schedule in (("pose", poses), ("finder", finder)):
         if schedule.start is not None:
             about[f"{name}_start"] = load_weights(schedule.start).about
-            about[f"{name}_start_share"] = schedule.start_share
         if schedule.restart_images > 0 and schedule.images > 0:
             about[f"{name}_restart_images"] = schedule.restart_images
     save_weights(path, pose_network, finder_network, about)
