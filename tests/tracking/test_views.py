@@ -90,6 +90,14 @@ def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand(
     assert bool((view.track.cloud.particles[:, 0] > 0.9 * ELSEWHERE).all())
 
 
+@pytest.mark.parametrize("believed_s", [0.0, 0.04])
+def test_a_track_elsewhere_is_tentative_unless_it_was_believed_until_then(
+    believed_s: float,
+) -> None:
+    view = gone_on(seen(THERE), confirmed=True, believed_s=believed_s)
+    assert view is not None and view.track.confirmed == (believed_s == 0)
+
+
 @pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])
 def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: SideDetection | None) -> None:
     assert gone_on(found, EMPTY) is None

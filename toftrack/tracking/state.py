@@ -80,7 +80,8 @@ class Track:
     likely, doubtful: how long it reached ConfidenceModel.believe, and was below its give_up.
     log_odds: that every joint of the estimate is within 40 mm, smoothed over time.
     whole_odds: that its mean error is, likewise.
-    confirmed: one of its estimates was believed; until then the track is tentative.
+    confirmed: one of its estimates was believed, since it was found elsewhere if it was doubted
+        then; until then the track is tentative.
     believed_s: since the last believed estimate, or since it began; 0 = the last one is not lost.
     asked_s: since the pose network looked at it.  parts: which pixels it called what then.
     features: of the last estimate, see confidence.py.

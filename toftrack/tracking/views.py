@@ -132,7 +132,11 @@ def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: s
 
 
 def restart_track(view: View) -> Track:
-    """The track at the best pose of the view's detection, with age 0: still of the same hand."""
+    """The track at the best pose of the view's detection, with age 0: still of the same hand.
+
+    A track whose last estimate was not believed is tentative there, or an elbow that the finder
+    takes for the hidden hand would be believed as little as that hand was.
+    """
     model, seen = view.model, without_things(view.observation, view.detection.parts)
     # Very different poses are compared: what explains more of the image counts in full.
     image = image_term(seen, view.fitted, model, coverage=1.0)
@@ -144,7 +148,7 @@ def restart_track(view: View) -> Track:
         side=old.side,
         evidence=old.evidence,
         shape=old.shape,
-        confirmed=old.confirmed,
+        confirmed=old.reliable,
         believed_s=old.believed_s,
     )
 
