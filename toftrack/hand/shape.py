@@ -214,7 +214,7 @@ def _rotation(degrees: float, axis: int) -> Tensor:
 
 
 def default_hand_shape(
-    hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right"
+    hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right", thickness: float = 1.0
 ) -> HandShape:
     """The mean adult hand, scaled to a hand length in metres; float32 on the CPU."""
     if not 0.08 <= hand_length_m <= 0.30:
@@ -230,4 +230,4 @@ def default_hand_shape(
     bones = torch.tensor(_BONES_MM, dtype=torch.float64)
     scale = hand_length_m / float(base[2].norm() + bones[2].sum())
     sizes = (base * scale).float(), torch.stack(frames).float(), (bones * scale).float()
-    return HandShape(*sizes).of_side(side)
+    return HandShape(*sizes, thickness).of_side(side)
