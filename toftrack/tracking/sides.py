@@ -37,10 +37,10 @@ _ELBOW_M, _FROM_CAMERA, _FACING = 0.25, -0.2, 0.1
 """Length of a forearm from the wrist. The share of it that leads away from the camera where its
 person may be on the camera's side, or surely faces it: arms of who wears a camera, or sits below
 one, come from there."""
-_BODY_M, _BEHIND_M2, _BEFORE_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 0.01, 72
+_BODY_M, _BEHIND_M2, _BEFORE_M2, _BODY_ROWS = (0.12, 0.55), 0.03, 0.02, 72
 """How much farther from the camera, or nearer to it, than a raised hand the body is; its least
-visible area behind the hand, and before it, of which the image's border leaves little; and rows of
-the image that it is searched in."""
+visible area behind the hand, and before it, where the image's border leaves little of it, but more
+than of a forearm; and rows of the image that it is searched in."""
 _PARTNER, _TOLD = 2.0, 2.0
 """Log odds that two hands which are seen at once are of different sides, and that one which is seen
 alone is of the side that the user said."""
