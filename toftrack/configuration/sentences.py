@@ -211,10 +211,14 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
     if likely is not None:
         return f"{text}; did you mean {likely}?"
-    some = [str(name) for name in parent if name not in ("_target_", "hydra")]
+    where = key.rpartition(".")[0]
+    while where and not isinstance(OmegaConf.select(root, where), DictConfig):
+        where = where.rpartition(".")[0]
+    inside = OmegaConf.select(root, where) if where else root
+    some = [str(name) for name in inside if name not in ("_target_", "hydra")]
     if len(some) > _MOST:
         some = [*some[:_MOST], "..."]
-    return f"{text}; {parent._get_full_key(None) or 'the configuration'} has {', '.join(some)}"
+    return f"{text}; {where or 'the configuration'} has {', '.join(some)}"
 
 
 def _keys(config: object, prefix: str = "") -> Iterator[str]:

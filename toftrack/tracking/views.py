@@ -134,8 +134,8 @@ def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: s
 def restart_track(view: View) -> Track:
     """The track at the best pose of the view's detection, with age 0: still of the same hand.
 
-    A track whose last estimate was not believed is tentative there, or an elbow that the finder
-    takes for the hidden hand would be believed as little as that hand was.
+    A track whose last estimate was not believed is tentative there: an elbow that the finder takes
+    for a hidden hand must be as probable as a new hand to be believed.
     """
     model, seen = view.model, without_things(view.observation, view.detection.parts)
     # Very different poses are compared: what explains more of the image counts in full.
