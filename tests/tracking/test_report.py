@@ -95,6 +95,14 @@ def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
     assert numbers(before(), hand(0, confirmed=False), hand(1, lost=True)) == [1]
 
 
+def test_where_no_side_was_said_the_first_hand_is_reported_though_another_is_seen_better() -> None:
+    """The one that is held out comes first, see detect.held_out_first."""
+    pointing, palm = hand(0, log_odds=0.5), hand(1, "left", log_odds=2.5)
+    assert numbers(before(), pointing, palm) == numbers(before(), palm, pointing) == [0]
+    assert numbers(before(), hand(0, log_odds=-0.5), palm) == [1], "it is probably wrong"
+    assert numbers(before(known="left"), hand(0, log_odds=0.5), palm) == [1], "it comes back"
+
+
 @pytest.mark.parametrize("hands", [1, 2, 4])
 def test_a_hand_keeps_its_slot(hands: int) -> None:
     state = before(hands, track=1, known="right")

@@ -104,11 +104,14 @@ def assign_slots(
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
     """A track's worth to slot `number`; 0 or less where it may not take it.  right: log odds."""
-    worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), _MOST) + _MOST
+    several, wanted = len(state.slots), side_of_slot(number, state)
+    # Where nobody said which hand is meant, those that are probably right are worth the same: the
+    # first one is held out, see detect.held_out_first, and another one may only be seen better.
+    most = 0.0 if several == 1 and wanted is None and slot.known is None else _MOST
+    worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), most) + _MOST
     stays = slot.track == track.number
     # Of hands that are worth the same, the one that was found first comes first.
     worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
-    several, wanted = len(state.slots), side_of_slot(number, state)
     if several > 2:
         return worth
     if wanted is not None:
