@@ -105,8 +105,8 @@ def assign_slots(
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
     """A track's worth to slot `number`; 0 or less where it may not take it.  right: log odds."""
     several, wanted = len(state.slots), side_of_slot(number, state)
-    # Where nobody said which hand is meant, those that are probably right are worth the same: the
-    # first one is held out, see detect.held_out_first, and another one may only be seen better.
+    # Where nobody said which hand is meant, tracks that are probably right are worth the same: the
+    # first is the one held out (detect.held_out_first), another may just be seen better.
     most = 0.0 if several == 1 and wanted is None and slot.known is None else _MOST
     worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), most) + _MOST
     stays = slot.track == track.number
