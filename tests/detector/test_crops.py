@@ -31,10 +31,11 @@ from toftrack.detector.crops import (
     crop_rotation,
     wide,
 )
+from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
-from toftrack.detector.proposals import KEPT, NetworkOutput, Places, run_pose_network, start_finding
+from toftrack.detector.proposals import KEPT, Places, run_pose_network, start_finding
 from toftrack.detector.weights import load_weights
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -43,9 +44,17 @@ K = intrinsics(200.0, 144, 176)
 PRECOMPILED = np.array([[0.0, 0.0, 0.45]])
 
 
-def numbers(seen: NetworkOutput) -> dict[str, torch.Tensor]:
-    values = {name: getattr(seen, name) for name in NetworkOutput.__dataclass_fields__}
-    values["parts"] = torch.stack([torch.from_numpy(one.kind) for one in seen.parts])
+HYPOTHESES = "pivot_m rotvec angles joints_m log_size log_probability error_m".split()
+
+
+def numbers(seen: list[Detection]) -> dict[str, torch.Tensor]:
+    """(C, ...) of C detections."""
+    values = {name: torch.stack([getattr(one, name) for one in seen]) for name in HYPOTHESES}
+    values["keypoints_m"] = torch.stack([one.keypoints.points_m for one in seen])
+    values["sigma_m"] = torch.stack([one.keypoints.sigma_m for one in seen])
+    values["present"] = torch.tensor([one.present for one in seen])
+    values["right_side"] = torch.tensor([one.right_side for one in seen])
+    values["parts"] = torch.stack([torch.from_numpy(one.parts.kind) for one in seen])
     return values
 
 
@@ -113,7 +122,10 @@ def reference(
     away = hand.joints_m - (hand.frames[:, 0] @ torch.tensor(PIVOT_M))[:, None]
     away = away.unflatten(0, order.shape) * found["log_size"].exp()[..., None, None]
     found["joints_m"] = found["pivot_m"][:, :, None] + away
-    found |= {name: getattr(p, name) for name in ("sigma_m", "present", "right")}
+    lengths_m = DEFAULT_HAND_LENGTH_M * found["log_size"][:, 0].exp()
+    each = zip(found["keypoints_m"], p.sigma_m, lengths_m.tolist(), strict=True)
+    found["sigma_m"] = torch.stack([doubted_sigma_m(*one) for one in each])
+    found |= {"present": p.present.sigmoid(), "right_side": p.right.sigmoid()}
     return found | {"parts": p.parts.argmax(1).byte()}
 
 

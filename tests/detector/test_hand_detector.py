@@ -15,7 +15,8 @@ from helpers.tracking import sample
 
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector import hand_detector as module
-from toftrack.detector.hand_detector import Detection, HandDetector, merit
+from toftrack.detector.detection import Detection, doubted_sigma_m, merit
+from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.proposals import Places
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
@@ -147,10 +148,10 @@ def test_settings_are_checked() -> None:
 
 def test_keypoints_of_fingers_in_one_another_are_doubted() -> None:
     points = default_hand_points()
-    apart = module.doubted_sigma_m(points, torch.full((21,), 0.003), 0.19)
+    apart = doubted_sigma_m(points, torch.full((21,), 0.003), 0.19)
     together = points.clone()
     together[9:13] = points[5:9]
-    found = module.doubted_sigma_m(together, torch.full((21,), 0.003), 0.19)
+    found = doubted_sigma_m(together, torch.full((21,), 0.003), 0.19)
     assert float(apart.max()) < 0.01
     for first in (5, 9):
         assert bool((found[first + 1 : first + 4] > 0.05).all()) and float(found[first]) < 0.01

@@ -14,7 +14,7 @@ from torch import nn
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.proposals import Places
 from toftrack.detector.weights import make_ready

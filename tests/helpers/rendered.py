@@ -11,7 +11,7 @@ from helpers.detection import FixedDetector, detection_of
 from helpers.tracking import make_tracker
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.detection import NO_DETECTION, Detection
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image

@@ -11,7 +11,7 @@ import torch
 from helpers.detection import detection_of
 from helpers.tracking import make_tracker, sample
 
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shaped
 from toftrack.hand.skeleton import forward_kinematics

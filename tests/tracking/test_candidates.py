@@ -14,7 +14,7 @@ from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of
 from helpers.settings import refinement
 
 from toftrack.detector.crops import crop_rotation
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.detector.network import PARTS
 from toftrack.detector.parts import BACKGROUND_PART, FOREARM_PART, HAND_PART, THING_PART, Parts
 from toftrack.refinement.shape_fit import first_shape

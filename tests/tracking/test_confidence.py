@@ -15,7 +15,7 @@ from helpers.settings import confidence_model
 from helpers.tracking import make_tracker, sample
 
 from toftrack.compute.pace import FRAME_S, Duration
-from toftrack.detector.hand_detector import NO_DETECTION
+from toftrack.detector.detection import NO_DETECTION
 from toftrack.errors import ToftrackError
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.segmentation import Observation

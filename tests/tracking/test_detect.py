@@ -14,7 +14,7 @@ from helpers.rendered import any_hand_model, hand_at, image_of, scene_of, state_
 from toftrack.compute.pace import FRAME_S
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.crops import crop_rotation
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.detector.network import PARTS
 from toftrack.detector.parts import FOREARM_PART, Parts
 from toftrack.detector.proposals import Places

@@ -13,7 +13,7 @@ from helpers.rendered import any_hand_model, hand_at, image_of, track_of, view_o
 from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
 
 from toftrack.compute.pace import FRAME_S
-from toftrack.detector.hand_detector import NO_DETECTION
+from toftrack.detector.detection import NO_DETECTION
 from toftrack.errors import ToftrackError
 from toftrack.frames.frame import DepthImage
 from toftrack.tracking.sides import (

@@ -34,28 +34,29 @@ _PIVOT = np.array(PIVOT_M)
 
 
 @entry_point
-def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, c, out):
+def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, out):
     """What the network's outputs for a crop mean, see PoseNet.decode.
 
     heads: (REPORTED,).  keypoints: (5 * JOINTS, CELLS, CELLS).  depth: (CROP, CROP), the first
     channel.  turn, centre, mirror: as of crop_at.
     hand: frames (5, 3, 3), places (5, 3) and bones (5, 3) of the mean one.
-    c, out: the row to write in the arrays of proposals._SHAPES.
+    out: written: proposals' arrays of hypotheses; keypoints (21, 3), their deviations (21,); log
+    odds (2,) of a hand, and of the side that was looked for.
     """
-    joints, sigma, present, right = out[7:]
-    present[c], right[c] = heads[len(_ANCHORS) * EACH], heads[len(_ANCHORS) * EACH + 1]
-    _decode_hypotheses(heads, turn, centre, mirror, hand, c, out)
-    _decode_keypoints(keypoints, depth, joints[c], sigma[c])
+    joints, sigma, odds = out[7:]
+    odds[0], odds[1] = heads[len(_ANCHORS) * EACH], heads[len(_ANCHORS) * EACH + 1]
+    _decode_hypotheses(heads, turn, centre, mirror, hand, out)
+    _decode_keypoints(keypoints, depth, joints, sigma)
     for j in range(JOINTS):
-        p = joints[c, j]
+        p = joints[j]
         p64 = np.float64(p[0]), np.float64(p[1]), np.float64(p[2])
         _into_camera(p64, turn, centre, mirror, p)
 
 
 @compiled
-def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
+def _decode_hypotheses(reported, turn, centre, mirror, hand, out):
     """The likeliest hypotheses of a crop, in their order."""
-    pivot, rotvec, angles, log_size, log_probability, error, joints, _, _, _, _ = out
+    pivot, rotvec, angles, joints, log_size, log_probability, error, _, _, _ = out
     count = len(_ANCHORS)
     chance = np.empty(count, np.float64)
     for h in range(count):
@@ -68,7 +69,7 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
     frames, posed = np.empty((16, 3, 3), np.float64), np.empty((JOINTS, 3), np.float64)
     for kept in range(KEPT):
         h = _largest(chance)
-        log_probability[c, kept] = chance[h] - top - math.log(total)
+        log_probability[kept] = chance[h] - top - math.log(total)
         chance[h] = -np.inf
         one = reported[h * EACH : (h + 1) * EACH]
         _rotation(one, _ANCHORS[h], turn, matrix)
@@ -76,25 +77,25 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, c, out):
         sign = -1.0 if mirror else 1.0
         for i in range(3):
             state[3 + i] = turned[i] if i == 0 else sign * turned[i]
-            rotvec[c, kept, i] = state[3 + i]
+            rotvec[kept, i] = state[3 + i]
         for j in range(ANGLES):
             low, high = _LIMITS[j]
             state[6 + j] = low + (high - low) / (1 + math.exp(-one[6 + j]))
-            angles[c, kept, j] = state[6 + j]
-        log_size[c, kept] = LOG_SIZE * one[6 + ANGLES]
+            angles[kept, j] = state[6 + j]
+        log_size[kept] = LOG_SIZE * one[6 + ANGLES]
         x, y, z = one[7 + ANGLES], one[8 + ANGLES], one[9 + ANGLES]
         at = (OFFSET_M * x, OFFSET_M * y, OFFSET_M * z)
-        _into_camera(at, turn, centre, mirror, pivot[c, kept])
-        error[c, kept] = ERROR_M * _softplus(one[EACH - 1]) + LEAST_ERROR_M
+        _into_camera(at, turn, centre, mirror, pivot[kept])
+        error[kept] = ERROR_M * _softplus(one[EACH - 1]) + LEAST_ERROR_M
         pose_hand(state, hand[0], hand[1], hand[2], sign, frames, posed)
-        size = math.exp(log_size[c, kept])
+        size = math.exp(log_size[kept])
         for i in range(3):
             # A mirror changes nothing on the palm's middle line.
             middle = 0.0
             for k in range(3):
                 middle += frames[0, i, k] * _PIVOT[k]
             for j in range(JOINTS):
-                joints[c, kept, j, i] = pivot[c, kept, i] + size * (posed[j, i] - middle)
+                joints[kept, j, i] = pivot[kept, i] + size * (posed[j, i] - middle)
 
 
 @compiled

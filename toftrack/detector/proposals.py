@@ -7,22 +7,25 @@ found is mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from torch import Tensor
 
 from toftrack.compute.threads import beside, run_shared
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_at, crop_rotation, wide
 from toftrack.detector.decoding_numba import KEPT, decode_at
-from toftrack.detector.network import ANGLES, JOINTS, PARTS, STRIDE, Finder, Found, PoseNet
+from toftrack.detector.detection import Detection, doubted_sigma_m
+from toftrack.detector.network import ANGLES, JOINTS, STRIDE, Finder, Found, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet
 from toftrack.detector.parts import Parts, likeliest_parts
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
+from toftrack.refinement.gauss_newton import Keypoints
 
 SAME_PLACE_M = 0.06
 """Hands that are detected closer together are one."""
@@ -41,33 +44,6 @@ class Places:
 
     centre_m: np.ndarray
     probability: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class NetworkOutput:
-    """What the pose network says of C crops, in the camera frame.
-
-    pivot_m: (C, H, 3) middle of the palm.  rotvec: (C, H, 3).  angles: (C, H, 21).
-    log_size: (C, H) of the hand's length in units of the mean adult's.
-    log_probability, error_m: (C, H).  Hypotheses are sorted by probability.
-    joints_m: (C, H, 21, 3) of mean hands of these sizes.
-    keypoints_m: (C, 21, 3) joints by the cells' means.  sigma_m: (C, 21) their deviations.
-    present, right: (C,) logits; `right` is of the side that was searched for.
-    parts: what it says of the pixels, of each crop.
-    """
-
-    pivot_m: Tensor
-    rotvec: Tensor
-    angles: Tensor
-    log_size: Tensor
-    log_probability: Tensor
-    error_m: Tensor
-    joints_m: Tensor
-    keypoints_m: Tensor
-    sigma_m: Tensor
-    present: Tensor
-    right: Tensor
-    parts: tuple[Parts, ...]
 
 
 def start_finding(
@@ -120,20 +96,16 @@ def _apart(centres_m: np.ndarray, most: int) -> list[int]:
     return kept
 
 
-_SHAPES = {
+_OF_HYPOTHESES = {
     "pivot_m": (KEPT, 3),
     "rotvec": (KEPT, 3),
     "angles": (KEPT, ANGLES),
+    "joints_m": (KEPT, JOINTS, 3),
     "log_size": (KEPT,),
     "log_probability": (KEPT,),
     "error_m": (KEPT,),
-    "joints_m": (KEPT, JOINTS, 3),
-    "keypoints_m": (JOINTS, 3),
-    "sigma_m": (JOINTS,),
-    "present": (),
-    "right": (),
 }
-"""Of a crop: the numbers of a NetworkOutput, as the compiled code writes them."""
+"""Fields of a Detection that have a row for each hypothesis, as the compiled code writes them."""
 
 
 def run_pose_network(
@@ -143,17 +115,27 @@ def run_pose_network(
     centres_m: np.ndarray,
     side: str,
     up: np.ndarray | None = None,
-) -> NetworkOutput:
-    """Hypotheses of a hand of one side about each of C centres (C, 3); C is at least 1.
+) -> list[Detection]:
+    """What a hand of one side is like about each of C centres (C, 3), in their order.
 
     up: (C, 3) where the fingers point, as far as that is known, which is up in the crops, see
     crops.crop_rotation; None: crops as the camera is held. A network that learns hands that are
     upright, more or less, knows them better.
     """
-    crops = _Crops(pose, depth_m, k, centres_m, side, up)
-    rows = iter(range(len(crops.centres)))
-    run_shared(lambda: crops.propose(rows), len(crops.centres) if _may_be_shared(pose) else 1)
-    return crops.reported()
+    count, found = len(centres_m), dict[int, Detection]()
+    rows = iter(range(count))
+
+    def look() -> None:
+        """At the next place as long as there is one, which other threads may have taken.
+
+        At each by itself: a batch takes as long, and what is said of a crop would depend on others.
+        """
+        for row in rows:
+            crop = _Crop(depth_m, k, centres_m[row], side, None if up is None else up[row])
+            found[row] = crop.decode(pose.outputs(crop.image))
+
+    run_shared(look, count if _may_be_shared(pose) else 1)
+    return [found[row] for row in range(count)]
 
 
 def start_pose_network(
@@ -163,24 +145,16 @@ def start_pose_network(
     centre_m: np.ndarray,
     side: str,
     up: np.ndarray | None = None,
-) -> Callable[[], NetworkOutput]:
+) -> Callable[[], Detection]:
     """The same at one place (3,), `up` (3,), begun in another thread if there may be one; what is
     returned waits for it.
 
     That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
     """
-    given = pose, depth_m, k, centre_m[None], side, None if up is None else up[None]
-    if isinstance(pose, PoseNet) or not _may_be_shared(pose):
-        return functools.partial(run_pose_network, *given)
-    crops = _Crops(*given)
-    image = crops.image(0)
-    wait = beside(functools.partial(pose.outputs, image))
-
-    def reported() -> NetworkOutput:
-        crops.decode(0, image, wait())
-        return crops.reported()
-
-    return reported
+    crop = _Crop(depth_m, k, centre_m, side, up)
+    look = functools.partial(pose.outputs, crop.image)
+    wait = beside(look) if _may_be_shared(pose) else look
+    return lambda: crop.decode(wait())
 
 
 def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
@@ -188,61 +162,49 @@ def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
     return isinstance(pose, OnnxPoseNet) and decode_at.is_compiled
 
 
-class _Crops:
-    """Crops, and what is found in them, in arrays of _SHAPES and of the parts' kinds, which are
-    written row by row.
+class _Crop:
+    """What the pose network sees of a hand of one side at a place.
+
+    image: (1, CROP_CHANNELS, CROP, CROP).
     """
 
     def __init__(
         self,
-        pose: PoseNet | OnnxPoseNet,
         depth_m: np.ndarray,
         k: np.ndarray,
-        centres_m: np.ndarray,
+        centre_m: np.ndarray,
         side: str,
         up: np.ndarray | None,
     ) -> None:
-        self.pose, self.left, self.hand = pose, side == "left", _mean_hand(side)
-        self.depth = np.ascontiguousarray(depth_m, np.float32)
         # Copies: numba compiles once more for arrays that must not be written to.
-        self.k = np.array(k, np.float64)
-        flip = _MIRROR if self.left else 1.0
-        self.centres = np.array(centres_m, np.float64).reshape(-1, 3) * flip
-        if self.left:  # depth, k and centres are, or are read, as a mirror shows them
-            self.k[0, 2] = depth_m.shape[1] - 1 - self.k[0, 2]
-        count = len(self.centres)
-        ups = [None] * count if up is None else list(np.asarray(up, np.float64) * flip)
-        self.rotations = list(map(crop_rotation, self.centres, ups))
-        self.numbers = tuple(np.empty((count, *one), np.float32) for one in _SHAPES.values())
-        self.kinds = np.empty((count, PARTS, PARTS), np.uint8)
+        k, centre, left = np.array(k, np.float64), np.array(centre_m, np.float64), side == "left"
+        if left:  # depth, k and centre are, or are read, as a mirror shows them
+            k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
+            centre *= _MIRROR
+            up = None if up is None else up * _MIRROR
+        turn = crop_rotation(centre, up)
+        self.place, self.hand = (turn, centre, left), _mean_hand(side)
+        self.image = np.empty((1, CROP_CHANNELS, CROP, CROP), np.float32)
+        crop_at(np.ascontiguousarray(depth_m, np.float32), left, k, centre, turn, self.image[0])
 
-    def propose(self, rows: Iterator[int]) -> None:
-        """Of the next crop as long as there is one, which other threads may have taken.
-
-        Each by itself: a batch takes as long, and what is said of a crop would depend on others.
-        """
-        for row in rows:
-            image = self.image(row)
-            self.decode(row, image, self.pose.outputs(image))
-
-    def image(self, row: int) -> np.ndarray:
-        """(1, CROP_CHANNELS, CROP, CROP)."""
-        image = np.empty((1, CROP_CHANNELS, CROP, CROP), np.float32)
-        crop_at(self.depth, self.left, self.k, self.centres[row], self.rotations[row], image[0])
-        return image
-
-    def decode(self, row: int, image: np.ndarray, outputs: tuple[np.ndarray, ...]) -> None:
-        """Write what the network's outputs for a crop mean."""
+    def decode(self, outputs: tuple[np.ndarray, ...]) -> Detection:
+        """What the network's outputs for the crop mean, in the camera frame."""
         heads, keypoints, painted = outputs
-        place = self.rotations[row], self.centres[row], self.left
-        decode_at(heads[0], keypoints[0], image[0, 0], *place, self.hand, row, self.numbers)
-        self.kinds[row] = likeliest_parts(painted[0])
-
-    def reported(self) -> NetworkOutput:
-        """All that was written."""
-        each = zip(self.kinds, self.rotations, self.centres, strict=True)
-        numbers = zip(_SHAPES, map(torch.from_numpy, self.numbers), strict=True)
-        return NetworkOutput(**dict(numbers), parts=tuple(Parts(*one, self.left) for one in each))
+        found = {name: np.empty(shape, np.float32) for name, shape in _OF_HYPOTHESES.items()}
+        points, sigma, odds = (np.empty(shape, np.float32) for shape in ((JOINTS, 3), JOINTS, 2))
+        written = *found.values(), points, sigma, odds
+        decode_at(heads[0], keypoints[0], self.image[0, 0], *self.place, self.hand, written)
+        length_m = DEFAULT_HAND_LENGTH_M * math.exp(found["log_size"][0])
+        points_m, sigma_m = torch.from_numpy(points), torch.from_numpy(sigma)
+        present, right_side = torch.from_numpy(odds).sigmoid().tolist()
+        hypotheses: dict[str, Any] = {name: torch.from_numpy(one) for name, one in found.items()}
+        return Detection(
+            **hypotheses,
+            keypoints=Keypoints(points_m, doubted_sigma_m(points_m, sigma_m, length_m)),
+            present=present,
+            right_side=right_side,
+            parts=Parts(likeliest_parts(painted[0]), *self.place),
+        )
 
 
 @functools.cache

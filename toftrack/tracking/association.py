@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
-from toftrack.detector.hand_detector import Detection, merit
+from toftrack.detector.detection import Detection, merit
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.filter import PredictedHand, palm_of
 from toftrack.tracking.model import TrackerModel

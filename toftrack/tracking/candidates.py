@@ -15,7 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.hand_detector import Detection, DetectorSettings
+from toftrack.detector.detection import Detection
+from toftrack.detector.hand_detector import DetectorSettings
 from toftrack.detector.parts import FOREARM_PART, THING_PART, Parts
 from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints, Refinement

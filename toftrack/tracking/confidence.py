@@ -21,7 +21,7 @@ from torch import Tensor
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.compute.rigid_numba import distance
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.errors import ToftrackError, check_number
 from toftrack.files.json_text import read_json
 from toftrack.render.segmentation import Observation

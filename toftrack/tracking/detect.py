@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.hand_detector import Detection, merit
+from toftrack.detector.detection import Detection, merit
 from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.confidence import log_odds

@@ -11,7 +11,7 @@ import torch
 
 from toftrack.compute.compiling import entry_point
 from toftrack.detector.crops import CROP_M
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.detector.parts import FOREARM_PART
 from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import range_image

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.frames.frame import DepthImage
 from toftrack.tracking.candidates import WORST, View, best_start
 from toftrack.tracking.confidence import log_odds, probability

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.pace import Duration, elapsed_s
-from toftrack.detector.hand_detector import Detection
+from toftrack.detector.detection import Detection
 from toftrack.detector.parts import ALL_HAND, Parts
 from toftrack.detector.proposals import Places
 from toftrack.frames.estimate import Estimate

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.hand_detector import NO_DETECTION, Detection
+from toftrack.detector.detection import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.refinement import shape_fit
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape

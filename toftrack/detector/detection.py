@@ -1,0 +1,129 @@
+"""A detection: what the pose network says of the hand at one place."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from toftrack.compute.rigid import pivot_offset
+from toftrack.detector.parts import ALL_HAND, Parts
+from toftrack.hand.overlap import overlap_of_each
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
+from toftrack.refinement.gauss_newton import Keypoints
+
+_DOUBT_M = 0.06
+"""How far off a finger's outer joints may be that lies in another one, by the keypoints."""
+_OUTER = np.array([0, 1, 1, 1], np.float32)
+"""Of a finger's joints, those that may be another one's."""
+_CLEAR_M = 0.010
+"""Expected error that counts as much as a factor e in probability."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What the pose network says of the hand at one place, likeliest hypothesis first.
+
+    pivot_m, rotvec, angles: (H, 3), (H, 3), (H, 21).  joints_m: (H, 21, 3) of a hand of that size.
+    log_size: (H,) of the hand's length in units of the mean adult's.
+    log_probability, error_m: (H,).
+    keypoints: the joints, each with its standard deviation.
+    present, right_side: probabilities that there is a hand, and that it is of the side looked for.
+    parts: which of the pixels are the hand, and which a thing's that it holds.
+    heat, merit: of a place of a search, the finder's probability, and how much speaks for a hand
+        there with all that is known, log scale.
+    """
+
+    pivot_m: Tensor
+    rotvec: Tensor
+    angles: Tensor
+    joints_m: Tensor
+    log_size: Tensor
+    log_probability: Tensor
+    error_m: Tensor
+    keypoints: Keypoints
+    present: float
+    right_side: float
+    parts: Parts = ALL_HAND
+    heat: float = 1.0
+    merit: float = math.inf
+
+    def states(self, ratio: float, count: int | None = None) -> Tensor:
+        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle.
+
+        count: of so many hypotheses at most; None = all.
+        """
+        pivot, rotvec = self.pivot_m.numpy()[:count], self.rotvec.numpy()[:count]
+        states = np.empty((len(rotvec), 27), np.float32)
+        states[:, 3:6], states[:, 6:] = rotvec, self.angles.numpy()[:count]
+        states[:, :3] = pivot - np.float32(ratio) * pivot_offset(rotvec)
+        return torch.from_numpy(states)
+
+    @property
+    def empty(self) -> bool:
+        """Whether nothing was said; see NO_DETECTION."""
+        return not len(self.rotvec)
+
+    @property
+    def length_m(self) -> float:
+        """The hand's length, the mean of the hypotheses'."""
+        weights = self.log_probability.softmax(0)
+        return DEFAULT_HAND_LENGTH_M * float((weights * self.log_size).sum().exp())
+
+    @property
+    def centre_m(self) -> Tensor:
+        """(3,) middle of the palm of the likeliest hypothesis."""
+        return self.pivot_m[0]
+
+    @property
+    def up(self) -> np.ndarray:
+        """(3,) where its fingers point: from the wrist to the middle finger's knuckle."""
+        wrist, knuckle = self.keypoints.points_m[[0, 9]].numpy()
+        return np.asarray(knuckle - wrist)
+
+
+NO_DETECTION = Detection(
+    pivot_m=torch.zeros(0, 3),
+    rotvec=torch.zeros(0, 3),
+    angles=torch.zeros(0, 21),
+    joints_m=torch.zeros(0, 21, 3),
+    log_size=torch.zeros(0),
+    log_probability=torch.zeros(0),
+    error_m=torch.zeros(0),
+    keypoints=Keypoints(torch.zeros(21, 3), torch.full((21,), torch.inf)),
+    present=0.0,
+    right_side=0.5,
+)
+"""Of a frame in which the network was not asked, or found no hand."""
+
+
+def merit(detection: Detection, heat: float) -> float:
+    """How much speaks for a hand of the side that is looked for at a place, log scale.
+
+    heat: the finder's probability.
+    """
+    odds = math.log(max(heat, 1e-6)) + math.log(max(detection.present, 1e-6))
+    odds += 0.5 * math.log(max(detection.right_side, 1e-3))
+    return odds - doubt_m(detection) / _CLEAR_M
+
+
+def doubt_m(detection: Detection) -> float:
+    """How far off the pose network takes itself to be, metres."""
+    return float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
+
+
+def doubted_sigma_m(points_m: Tensor, sigma_m: Tensor, hand_length_m: float) -> Tensor:
+    """(21,) deviations of keypoints (21, 3): larger where those of two fingers coincide.
+
+    Of a single finger that is seen the cells do not know which one it is, and say surely that it is
+    either; what is no hand, such as an elbow, has its fingers in one another.
+    """
+    # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
+    overlap = overlap_of_each(points_m[None], hand_length_m)[0].numpy()
+    doubt_m = _DOUBT_M * np.minimum(overlap, 1)[:, None] * _OUTER
+    sigma = sigma_m.numpy().copy()
+    sigma[1:] = np.hypot(sigma[1:], doubt_m.ravel())
+    return torch.from_numpy(sigma)
