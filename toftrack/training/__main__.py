@@ -38,14 +38,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
         for file in export_networks(asked.weights or DEFAULT_FILE, not asked.float):
             print(f"  {file} ({file.stat().st_size / 1e6:.1f} MB)")
-    elif asked.command == "fit-confidence":
+    else:
         from toftrack.training.fit_confidence import fit_confidence
 
         fit_confidence(asked)
-    else:
-        from toftrack.training.fit_joint_flags import fit_joint_flags
-
-        fit_joint_flags(asked)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -74,13 +70,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--output", type=Path, default=Path("confidence"), help="folder (confidence)")
     kept = "track the sequences that an earlier run kept here, or render and keep them"
     add("--sequences-from", type=Path, metavar="FOLDER", help=kept)
-    about = "choose lost.joint_ok on every second recording of each folder, show it on the others"
-    add = command("fit-joint-flags", about)
-    add("recordings", nargs="+", help=".npz files or folders of them, with truth")
-    add("--labels", action="append", default=[], metavar="FILE", help="of images without truth")
-    add("--seeds", type=int, default=1, help="how many runs of each (1)")
-    add("--right", type=float, default=4.0, help="per cent of the right tips to be flagged (4)")
-    add("--set", action="append", default=[], metavar="NAME=VALUE", dest="settings")
     return parser
 
 
