@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from helpers.tracking import ROOT
 
-from toftrack.devices.replay import Folder, Replay, Sample
+from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.programs import convert, record
@@ -183,19 +183,18 @@ def images(folder: Path, **changes: Any) -> Path:
 
 
 def test_a_folder_of_images(tmp_path: Path) -> None:
-    for kind in (Folder, Replay):
-        frames = list(kind(images(tmp_path / kind.__name__)))
-        assert [float(frame.depth[0, 0]) for frame in frames] == pytest.approx([0.1, 0.2, 1.0])
-        assert [frame.timestamp_s for frame in frames] == pytest.approx([0, 0.04, 0.08])
-        assert not frames[0].radial and frames[0].amplitude is None
+    frames = list(Replay(images(tmp_path / "f")))
+    assert [float(frame.depth[0, 0]) for frame in frames] == pytest.approx([0.1, 0.2, 1.0])
+    assert [frame.timestamp_s for frame in frames] == pytest.approx([0, 0.04, 0.08])
+    assert not frames[0].radial and frames[0].amplitude is None
 
 
 def test_what_a_folder_states_and_what_is_given(tmp_path: Path) -> None:
     folder = images(tmp_path / "f", camera={"depth_unit_m": 0.0002, "fps": 10, "radial": True})
-    device = Folder(folder)
+    device = Replay(folder)
     assert next(iter(device)).radial
     assert (device.fps, next(iter(device)).depth[0, 0]) == (10, pytest.approx(0.02))
-    device = Folder(folder, unit_m=0.01, fps=50)
+    device = Replay(folder, unit_m=0.01, fps=50)
     assert (device.fps, next(iter(device)).depth[0, 0]) == (50, pytest.approx(1.0))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from toftrack.api import make_device
-from toftrack.devices.replay import Folder, Replay
+from toftrack.devices.replay import Replay
 from toftrack.frames.camera import Camera
 from toftrack.recordings.doubts import (
     centre_doubt,
@@ -103,11 +103,11 @@ def test_a_folder_with_missing_numbers_is_doubted_until_it_has_times(tmp_path: P
         for frame, number in zip(sample, (1, 2, 5), strict=True):
             image = (1000 * frame.depth).astype(np.uint16)
             cv2.imwrite(str(tmp_path / f"depth_{number}.png"), image)
-    folder = Folder(tmp_path, intrinsics=[200, 200, 88, 72])
+    folder = Replay(tmp_path, intrinsics=[200, 200, 88, 72])
     assert folder.description["files"] == ["depth_1.png", "depth_2.png", "depth_5.png"]
     assert "leave out 2 (3-4)" in folder.description["doubts"][0]
     (tmp_path / "timestamps.txt").write_text("0.04\n0.08\n0.12\n")
-    assert Folder(tmp_path, intrinsics=[200, 200, 88, 72]).description["doubts"] == []
+    assert Replay(tmp_path, intrinsics=[200, 200, 88, 72]).description["doubts"] == []
 
 
 def test_a_folder_in_another_unit_is_reported(tmp_path: Path) -> None:
@@ -116,9 +116,9 @@ def test_a_folder_in_another_unit_is_reported(tmp_path: Path) -> None:
     for step_m, right in ((0.01, "0.01 m a step"), (0.0001, "0.0001 m a step")):
         cv2.imwrite(str(tmp_path / "0.png"), (depth / step_m).astype(np.uint16))
         given = {"intrinsics": [200, 200, 88, 72]}
-        (doubt,) = Folder(tmp_path, **given).description["doubts"]
+        (doubt,) = Replay(tmp_path, **given).description["doubts"]
         assert right in doubt and "device.unit_m" in doubt
-        assert not Folder(tmp_path, unit_m=step_m, **given).description["doubts"]
+        assert not Replay(tmp_path, unit_m=step_m, **given).description["doubts"]
 
 
 def test_doubts_reach_the_log_and_whoever_asks_the_device(

@@ -28,7 +28,7 @@ from helpers.bags import (
 )
 from helpers.damage import damaged
 
-from toftrack.devices.replay import Bag, Replay
+from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings import ros_messages
@@ -86,7 +86,7 @@ def test_every_kind_of_bag_gives_the_frames_that_went_in(
 ) -> None:
     depth = some_depth()
     path = write_bag(tmp_path, kind, [colour(), *recording(depth, CAMERA, encoding)])
-    device = Bag(path)
+    device = Replay(path)
     frames = list(device)
     assert [frame.index for frame in frames] == list(range(6))
     np.testing.assert_allclose([frame.depth for frame in frames], depth, atol=1e-6)
@@ -132,7 +132,7 @@ def test_a_camera_info_may_come_late_and_without_one_a_camera_file_serves(tmp_pa
     with pytest.raises(ToftrackError, match=f"no message of {INFO}.*camera.file=FILE"):
         read_rosbag(path)
     CAMERA.save(tmp_path / "camera.json")
-    assert Bag(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 40
+    assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 40
 
 
 def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> None:
@@ -144,10 +144,10 @@ def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> Non
     path = write_bag(tmp_path, "bag", [*recording(some_depth(), CAMERA), *aligned, info])
     with pytest.raises(ToftrackError, match=rf"2 topics.*device.topic=.*/aligned/image.*{DEPTH}"):
         Replay(path)
-    depth = next(iter(Bag(path, topic="camera/aligned/image"))).depth
+    depth = next(iter(Replay(path, topic="camera/aligned/image"))).depth
     np.testing.assert_allclose(depth, some_depth()[0] / 2, atol=0.0006)
     with pytest.raises(ToftrackError, match="no images of the topic /nowhere"):
-        Bag(path, topic="/nowhere")
+        Replay(path, topic="/nowhere")
 
 
 @pytest.mark.parametrize(

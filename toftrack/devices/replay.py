@@ -17,9 +17,6 @@ from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
-from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.image_folder import read_image_folder
-from toftrack.recordings.rosbag import read_rosbag
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import (
     FIRST_SAMPLE,
@@ -46,8 +43,8 @@ class Replay(BaseDevice):
     always delivered); otherwise every frame, as fast as it is asked for.  camera_file, intrinsics
     (fx, fy, cx, cy in pixels): instead of the recording's own camera.  unit_m (metres of one step
     of whole numbers), fps, dataset (of a `.h5` or `.mat` that has several): of recordings that do
-    not say it.  store: the recording, where it is open already. Raises ToftrackError: the recording
-    or the camera cannot be used, or the range lies outside.
+    not say it.  topic: of a ROS bag that has several of depth images. Raises ToftrackError: the
+    recording or the camera cannot be used, or the range lies outside.
     """
 
     def __init__(
@@ -63,16 +60,15 @@ class Replay(BaseDevice):
         unit_m: float | None = None,
         fps: float | None = None,
         dataset: str | None = None,
-        store: FrameStore | None = None,
+        topic: str | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=PATH")
-        if store is None:
-            bare = BareFacts(intrinsics, unit_m, fps, dataset)
-            store = open_recording(path, camera_file, modulation_mhz, bare=bare)
-            for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
-                if told is not None and told != own:
-                    raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
+        bare = BareFacts(intrinsics, unit_m, fps, dataset)
+        store = open_recording(path, camera_file, modulation_mhz, topic, bare)
+        for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
+            if told is not None and told != own:
+                raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
         self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
@@ -113,7 +109,11 @@ class Replay(BaseDevice):
             "repeat": self._repeat,
             "camera_file": None if camera_file is None else str(camera_file),
             "doubts": list(found),
-        } | ({"files": list(store.names)} if store.names else {})
+        }
+        if store.names:
+            self.description["files"] = list(store.names)
+        if "topic" in store.metadata:
+            self.description["topic"] = store.metadata["topic"]
 
     def close(self) -> None:
         self._recording.close()
@@ -162,44 +162,6 @@ class Replay(BaseDevice):
             amplitude=amplitude,
             radial=recording.radial,
         )
-
-
-class Folder(Replay):
-    """The images of a folder, as `Replay`; what the folder does not state can be given."""
-
-    def __init__(
-        self,
-        path: str | Path,
-        unit_m: float | None = None,
-        fps: float | None = None,
-        camera_file: str | Path | None = None,
-        intrinsics: Sequence[float] | None = None,
-        **playback: Any,
-    ) -> None:
-        if not path:
-            raise ToftrackError("no folder was given; set device.path=FOLDER")
-        store = read_image_folder(path, camera_file, BareFacts(intrinsics, unit_m, fps))
-        playback |= {"camera_file": camera_file, "intrinsics": intrinsics}
-        super().__init__(path, store=store, **playback)
-        self.description |= {"device": "folder", "unit_m": store.unit_m}
-
-
-class Bag(Replay):
-    """The depth images of one topic of a bag, as `Replay` and `read_rosbag`."""
-
-    def __init__(
-        self,
-        path: str | Path,
-        topic: str | None = None,
-        unit_m: float | None = None,
-        camera_file: str | Path | None = None,
-        **playback: Any,
-    ) -> None:
-        if not path:
-            raise ToftrackError("no bag was given; set device.path=BAG")
-        store = read_rosbag(path, topic, camera_file, unit_m)
-        super().__init__(path, camera_file=camera_file, store=store, **playback)
-        self.description |= {"device": "rosbag", **store.metadata, "unit_m": store.unit_m}
 
 
 class Sample(Replay):
