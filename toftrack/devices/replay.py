@@ -17,6 +17,7 @@ from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import BareFacts
 from toftrack.recordings.doubts import doubts
+from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import (
     FIRST_SAMPLE,
@@ -43,8 +44,9 @@ class Replay(BaseDevice):
     always delivered); otherwise every frame, as fast as it is asked for.  camera_file, intrinsics
     (fx, fy, cx, cy in pixels): instead of the recording's own camera.  unit_m (metres of one step
     of whole numbers), fps, dataset (of a `.h5` or `.mat` that has several): of recordings that do
-    not say it.  topic: of a ROS bag that has several of depth images. Raises ToftrackError: the
-    recording or the camera cannot be used, or the range lies outside.
+    not say it.  topic: of a ROS bag that has several of depth images.  store: the recording,
+    where it is open already. Raises ToftrackError: the recording or the camera cannot be used, or
+    the range lies outside.
     """
 
     def __init__(
@@ -61,14 +63,16 @@ class Replay(BaseDevice):
         fps: float | None = None,
         dataset: str | None = None,
         topic: str | None = None,
+        store: FrameStore | None = None,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=PATH")
-        bare = BareFacts(intrinsics, unit_m, fps, dataset)
-        store = open_recording(path, camera_file, modulation_mhz, topic, bare)
-        for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
-            if told is not None and told != own:
-                raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
+        if store is None:
+            bare = BareFacts(intrinsics, unit_m, fps, dataset)
+            store = open_recording(path, camera_file, modulation_mhz, topic, bare)
+            for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
+                if told is not None and told != own:
+                    raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
         self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
