@@ -117,7 +117,9 @@ def test_an_image_of_any_floating_type_and_layout_gives_the_same_hand() -> None:
     scene = sample()
     depth = scene.depth_m[0]
     holes = np.where(depth > 0, depth, np.nan)
-    kinds = (depth, depth.astype(np.float64), np.asfortranarray(depth), torch.from_numpy(holes))
+    masked = np.ma.masked_array(np.where(depth > 0, depth, 0.4), depth <= 0)
+    other = (depth.astype(np.float64), np.asfortranarray(depth), torch.from_numpy(holes), masked)
+    kinds = (depth, *other)
     joints = [toftrack.make_tracker(*QUICK).step(kind, scene.k).joints_m for kind in kinds]
     assert np.isfinite(joints[0]).all()
     assert all(np.array_equal(joints[0], other) for other in joints[1:])

@@ -31,8 +31,10 @@ def make_tracker(*overrides: str, config_dir: str | Path | None = None) -> Track
     Any number of them may work in one process, each in a thread of its own; one tracker must not be
     used by two threads at once.
 
-    overrides: as on the command line, "hand.side=left" or "filter.particles=1000".
-    config_dir: a folder with your own config.yaml and its groups, instead of toftrack's.
+    overrides: as on the command line, "hand.side=left" or "filter.particles=1000"; those of device,
+        view, stream, smooth and of files are without effect on a tracker by itself.
+    config_dir: a folder with choices of your own, GROUP/NAME.yaml, beside toftrack's; or with a
+        config.yaml and all its groups, instead of them.
 
     Raises ToftrackError: an override or a file that it names cannot be used, or hands is above 1.
     """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import subprocess
 import sys
 from pathlib import Path
 
@@ -243,6 +244,13 @@ def test_exit_requests_keep_to_the_promised_statuses(
         raise SystemExit(code)
 
     assert run(main) == status
+
+
+@pytest.mark.parametrize("words", ["--help", "train --help", "fit-confidence --help"])
+def test_help_of_a_module_that_is_run_is_no_error(words: str) -> None:
+    command = [sys.executable, "-m", "toftrack.training", *words.split()]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and "usage: python -m toftrack.training" in done.stdout
 
 
 def test_a_cause_deep_inside_is_what_is_reported() -> None:

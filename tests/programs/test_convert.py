@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,25 @@ def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path) -> N
     assert made.fps == pytest.approx(12.5)
     with pytest.raises(ToftrackError, match="--intrinsics"):
         convert.main([str(path), str(tmp_path / "other.npz")])
+
+
+def test_the_lens_goes_before_an_npz_s_own_and_other_facts_stand_in_for_missing_ones(
+    tmp_path: Path,
+) -> None:
+    depth = np.full((3, 6, 8), 0.5, np.float32)
+    np.savez(tmp_path / "bare.npz", depth_m=depth)
+    np.savez(tmp_path / "whole.npz", depth_m=depth, K=np.diag((9.0, 9, 1)), fps=10.0)
+    lens = BareFacts((30.0, 30.0, 3.5, 2.5), fps=12.0)
+    convert.convert(tmp_path / "bare.npz", tmp_path / "made.npz", bare=lens)
+    made = read_recording(tmp_path / "made.npz")
+    assert (made.camera.K[0, 0], made.fps) == (30, pytest.approx(12))
+    with pytest.raises(ToftrackError, match=r"says its fps itself.*--fps"):
+        convert.convert(tmp_path / "whole.npz", tmp_path / "no.npz", bare=lens)
+    convert.convert(tmp_path / "whole.npz", tmp_path / "other.npz", bare=replace(lens, fps=None))
+    other = read_recording(tmp_path / "other.npz")
+    assert (other.camera.K[0, 0], other.fps) == (30, pytest.approx(10))
+    with pytest.raises(ToftrackError, match="key 'K'.*--intrinsics"):
+        convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz")
 
 
 def test_convert_errors(srs: Path, tmp_path: Path) -> None:

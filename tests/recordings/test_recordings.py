@@ -224,6 +224,14 @@ def test_what_breaks_the_format_is_reported_by_its_key(
     assert key in text and re.search(words, text)
 
 
+def test_a_hand_that_is_not_visible_may_be_nowhere(tmp_path: Path) -> None:
+    joints = arrays()["joints_m"]
+    joints[2] = np.nan  # the frame in which it is not visible
+    truth = read_recording(save(tmp_path, joints_m=joints)).truth
+    assert truth is not None and np.isfinite(truth.joints_m).all()
+    np.testing.assert_array_equal(truth.joints_m[[0, 1, 3]], joints[[0, 1, 3]])
+
+
 def test_damage_on_the_way_is_reported_when_it_is_met(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

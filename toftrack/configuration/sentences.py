@@ -23,6 +23,8 @@ _ALIKE, _MOST = 0.6, 12
 """How much of a name must be right, 0..1; so many names are listed at most."""
 _MEANT = {"K": "intrinsics", "web": "browser"}
 """What other programs call a setting or a choice."""
+_HYDRAS = ("joblib", "optuna", "ray")
+"""Launchers and sweepers of Hydra that are extras of the package."""
 _PAPERS_GROUP = "start"
 """A group that experiment=paper alone has."""
 _OF_PAPER = "{0} belongs to experiment=paper; give experiment=paper as well, or leave {0} out"
@@ -71,7 +73,9 @@ def place_of(error: BaseException) -> str:
     """Where code of one's own raised it: class, file and line; "" where none did."""
     theirs = {e.module.split(".")[0] for name in ENTRY_POINTS for e in installed(name).values()}
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
-        code, root = frame.f_code, str(frame.f_globals.get("__name__")).partition(".")[0]
+        code, spec = frame.f_code, frame.f_globals.get("__spec__")
+        # Of `python -m` the spec alone says which module it is.
+        root = str(getattr(spec, "name", frame.f_globals.get("__name__"))).partition(".")[0]
         ours = root == "toftrack" or root in sys.stdlib_module_names or code.co_filename[0] == "<"
         if root in theirs or not (ours or "-packages" in code.co_filename):
             return f", in {code.co_qualname} ({code.co_filename}, line {line})"
@@ -177,7 +181,8 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     shortened = re.compile(".*".join(map(re.escape, word))).match  # kpca, of kernel_pca
     likely = next(filter(shortened, options), None) or _nearest(_MEANT.get(word, word), options)
     hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
-    return f"there is no {group}={word}; {hint} {', '.join(options)}"
+    extra = f" (or pip install 'toftrack[{word}]')" if word in _HYDRAS else ""
+    return f"there is no {group}={word}{extra}; {hint} {', '.join(options)}"
 
 
 def _of_key(chain: Sequence[BaseException]) -> str | None:

@@ -70,9 +70,6 @@ class Replay(BaseDevice):
         if store is None:
             bare = BareFacts(intrinsics, unit_m, fps, dataset)
             store = open_recording(path, camera_file, modulation_mhz, topic, bare)
-            for name, told, own in (("unit_m", unit_m, store.unit_m), ("fps", fps, store.fps)):
-                if told is not None and told != own:
-                    raise ToftrackError(f"'{path}' says its {name} itself; leave device.{name} out")
         self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
@@ -90,8 +87,6 @@ class Replay(BaseDevice):
         camera, size = store.camera, (store.camera.width, store.camera.height)
         if camera_file is not None:
             camera = Camera.load_for(camera_file, *size, f"'{path}'")
-        elif given := BareFacts(intrinsics).camera(*size):
-            camera = given
         found = doubts(store, camera)
         for doubt in found:
             _log.warning("%s: %s", path, doubt)

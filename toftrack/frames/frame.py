@@ -161,7 +161,8 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     the wrong shape, type or unit.
     """
     try:
-        depth = np.asarray(depth_m)
+        masked = isinstance(depth_m, np.ndarray) and hasattr(depth_m, "filled")
+        depth = np.asarray(depth_m.filled(0) if masked else depth_m)  # masked: no reading
         matrix = np.asarray(k)
     except (TypeError, ValueError, RuntimeError) as error:  # a ragged list, a tensor on a GPU
         raise ToftrackError(

@@ -237,7 +237,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         ) from error
     except KeyError as error:
         raise ToftrackError(
-            f"'{path}' is not a track.npz of this toftrack: {error.args[0]}; give the path of one"
+            f"'{path}' is not a track.npz of this toftrack (it has no '{error.args[0]}'); give one"
         ) from None
     except (ValueError, TypeError, AttributeError) as error:
         raise ToftrackError(

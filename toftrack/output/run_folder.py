@@ -89,8 +89,7 @@ class Run:
         store, name = opened
         device = self.config.get("device") or {}
         about = self.results["metadata"].get("device") or {}
-        given = BareFacts(device.get("intrinsics"))
-        camera = given.camera(store.camera.width, store.camera.height) or store.camera
+        camera = store.camera
         if about.get("camera_file"):
             camera = Camera.load(found_again(about["camera_file"], self._ran_in))
         rows = _rows(self, store, camera, about, device, name)

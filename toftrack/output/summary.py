@@ -227,7 +227,7 @@ def metrics_line(summary: dict[str, Any]) -> str:
     parts = [
         f"{summary['frames']} frames",
         f"{summary['lost_frames']} lost",
-        f"{text_of(summary['mean_ms'])} ms a frame",
+        f"{text_of(summary['median_ms'])} ms a frame",
         f"mean score {text_of(summary['mean_score'], 3)}",
     ]
     if metrics := summary.get("metrics"):
@@ -275,6 +275,7 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
         ("usable", f"{usable} % of the {seen} visible frames{between}"),
         ("silently wrong", f"{silent} %{in_a_row}"),
         ("false alarms", f"{alarms} %"),
+        ("joint error", f"{text_of(trust['mean_mm'])} mm, of visible frames that are not lost"),
         ("first right", right if seen else "-"),
     ]
     after = ["never" if frames is None else str(frames) for frames in trust["found_after"]]
@@ -285,20 +286,19 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
 
 def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Errors, regions, flags and when the hand was found again: names and texts."""
-    near = metrics["frames_max_below_40mm_pct"] if metrics["frames"] else None
-    rows = [
-        ("joint error, mean", f"{text_of(metrics['mean_mm'])} mm"),
-        ("joint error, median", f"{text_of(metrics['median_mm'])} mm"),
-        ("fingertip error", f"{text_of(metrics['fingertip_mm'])} mm"),
-        ("wrist-aligned error", f"{text_of(metrics['wrist_aligned_mm'])} mm, wrists put together"),
-        ("frames below 40 mm", f"{text_of(near)} %"),
-    ]
+    rows: list[tuple[str, str]] = []
+    if metrics["frames"]:
+        wrists = f"{text_of(metrics['wrist_aligned_mm'])} mm, wrists put together"
+        rows = [
+            ("in the pose space", f"{metrics['frames']} frames from the sixth on; of these:"),
+            ("joint error, mean", f"{text_of(metrics['mean_mm'])} mm"),
+            ("joint error, median", f"{text_of(metrics['median_mm'])} mm"),
+            ("fingertip error", f"{text_of(metrics['fingertip_mm'])} mm"),
+            ("wrist-aligned error", wrists),
+            ("frames below 40 mm", f"{text_of(metrics['frames_max_below_40mm_pct'])} %"),
+        ]
     if metrics["missing_pct"]:
         rows.append(("without estimate", f"{text_of(metrics['missing_pct'])} %"))
-    precision, recall = metrics["lost_precision"], metrics["lost_recall"]
-    if precision is not None or recall is not None:
-        text = f"precision {text_of(precision, 2)}, recall {text_of(recall, 2)}"
-        rows.append(("lost frames", text))
     coverage, further = metrics["coverage"], metrics["further"]
     if (inside := coverage["in_region_90_pct"]) is not None:
         hidden = coverage["hidden_in_region_90_pct"]

@@ -140,10 +140,10 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpa
 
 
 def _seeds(text: str) -> list[int]:
-    seeds = list(dict.fromkeys(int(part) for part in text.split(",")))
-    if min(seeds) < 0:
-        raise ValueError
-    return seeds
+    seeds = list(dict.fromkeys(part.strip() for part in text.split(",")))
+    if not all(map(str.isdecimal, seeds)):
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole numbers from 0 on, as 0,1,2")
+    return list(map(int, seeds))
 
 
 def _workers(text: str) -> int:

@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     path = config.device.get("path")
     if path is None:
         raise ToftrackError(
-            "only a recording can be labelled; record the camera first, and give it"
+            "only a recording with a file of its own can be labelled; give the file's name"
         )
     with one_sentence():
         device: Device = instantiate(config.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from abc import abstractmethod
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -54,7 +55,7 @@ def file_of(path: str | Path) -> Path:
     """The path of a recording that is one file; ToftrackError where there is no file, or none to be
     opened.
     """
-    path, give = Path(path).expanduser(), "give the path of a recording"
+    path, give = Path(os.path.expanduser(path)), "give the path of a recording"
     with reading(path):  # too long a name
         if path.is_dir():
             raise ToftrackError(f"'{path}' is a directory; {give}")

@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import stat
 import zipfile
@@ -189,7 +190,7 @@ def read_image_folder(
     no folder, depth image or camera, or the first image is damaged, or of another size than the
     camera's; later, another one.
     """
-    folder = Path(folder).expanduser()
+    folder = Path(os.path.expanduser(folder))
     zipped = folder.suffix.lower() == ".zip" and not folder.is_dir()
     if not zipped and not folder.is_dir():
         raise ToftrackError(f"there is no folder '{folder}'; give a folder of depth images")
@@ -315,7 +316,7 @@ class PngFolderWriter:
         fps: float = DEFAULT_FPS,
         metadata: dict[str, Any] | None = None,
     ) -> None:
-        self.folder, self.unit_m, self.frames = Path(folder).expanduser(), unit_m, 0
+        self.folder, self.unit_m, self.frames = Path(os.path.expanduser(folder)), unit_m, 0
         facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
         with self._writing():
             self.folder.mkdir(parents=True, exist_ok=True)

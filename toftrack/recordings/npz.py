@@ -42,6 +42,7 @@ from toftrack.frames.frame import (
     median_reading,
     wrong_unit,
 )
+from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 
 LOADED_BYTES = MOST_BYTES
@@ -151,9 +152,13 @@ class Recording(FrameStore):
                 images.close()
 
 
-def read_recording(path: str | Path) -> Recording:
+def read_recording(
+    path: str | Path, camera_file: str | Path | None = None, bare: BareFacts = NOTHING_GIVEN
+) -> Recording:
     """Read and check a recording. ToftrackError, one sentence that names the file, when it is
     missing, damaged, contains pickled objects or breaks the format above.
+
+    camera_file, bare: its camera, and its frame rate, where it says nothing of them.
     """
     path = file_of(path)
     try:
@@ -169,7 +174,7 @@ def read_recording(path: str | Path) -> Recording:
             f"the recording '{path}' is damaged ({error}); copy or record it again"
         ) from error
     try:
-        return _parse(arrays)
+        return _parse(arrays, camera_file, bare)
     except ToftrackError as error:
         raise ToftrackError(f"the recording '{path}' cannot be used: {error}") from None
 
@@ -232,15 +237,13 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
     }
 
 
-def _parse(arrays: dict[str, Any]) -> Recording:
+def _parse(arrays: dict[str, Any], camera_file: str | Path | None, bare: BareFacts) -> Recording:
     depth_key = "depth_m" if "depth_m" in arrays else "radial_m"
-    if "K" not in arrays:
-        raise ToftrackError("the required key 'K' (3x3 camera matrix, pixels) is missing; add it")
     depth = _check_depth(arrays[depth_key], depth_key)
     _check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
-    camera = _camera_of(arrays, width, height)
-    timestamp_s, fps = _times(arrays, count)
+    camera = _camera_of(arrays, width, height, camera_file, bare)
+    timestamp_s, fps = _times(arrays, count, bare.fps)
     metadata = _metadata(arrays)
     return Recording(
         depth=depth,
@@ -265,7 +268,8 @@ def _check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> N
     """ToftrackError where the images' middle and K say that the frames are counted last."""
     per_frame = ("timestamp_s", *_TRUTH)
     lengths = {len(arrays[name]) for name in per_frame if name in arrays and arrays[name].ndim}
-    centre = np.asarray(arrays["K"])[:2, 2] if np.shape(arrays["K"]) == (3, 3) else None
+    k = np.asarray(arrays.get("K", ()))
+    centre = k[:2, 2] if k.shape == (3, 3) else None
     if centre is None or centre.dtype.kind not in "iuf" or shape[0] in lengths:
         return
     aside, aside_if_last = (
@@ -297,7 +301,8 @@ def _check_depth(depth: Images, key: str) -> Images:
     return depth if kept or isinstance(depth, StreamedImages) else depth.astype(np.float32)
 
 
-def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
+def _times(arrays: dict[str, Any], count: int, given: float | None) -> tuple[np.ndarray, float]:
+    """Times and rate.  given: the rate of a file that says neither."""
     fps = None
     if "fps" in arrays:
         if arrays["fps"].size != 1 or arrays["fps"].dtype.kind not in "iuf":
@@ -306,7 +311,7 @@ def _times(arrays: dict[str, Any], count: int) -> tuple[np.ndarray, float]:
         if not (np.isfinite(fps) and fps > 0):
             raise ToftrackError(f"'fps' must be a positive number, but is {fps:g}")
     if "timestamp_s" not in arrays:
-        fps = DEFAULT_FPS if fps is None else fps
+        fps = fps or given or DEFAULT_FPS
         return np.arange(count) / fps, fps
     timestamp_s = _shaped(arrays, "timestamp_s", (count,)).astype(np.float64)
     if not np.isfinite(timestamp_s).all() or (np.diff(timestamp_s) < 0).any():
@@ -349,8 +354,23 @@ def camera_arrays(camera: Camera) -> dict[str, np.ndarray]:
     return {key: np.array(content[key]) for key in _CAMERA if content.get(key)}
 
 
-def _camera_of(arrays: dict[str, Any], width: int, height: int) -> Camera:
-    """The camera of images of that size, px; `K` must be there. Raises ToftrackError."""
+def _camera_of(
+    arrays: dict[str, Any],
+    width: int,
+    height: int,
+    camera_file: str | Path | None,
+    bare: BareFacts,
+) -> Camera:
+    """The camera of images of that size, px: the file's, else the given one. ToftrackError."""
+    if "K" not in arrays:
+        if camera_file is not None:
+            return Camera.load(camera_file)
+        if lens := bare.camera(width, height):
+            return lens
+        raise ToftrackError(
+            "the required key 'K' (3x3 camera matrix, pixels) is missing; add it, or give the lens "
+            "with device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY)"
+        )
     given: dict[str, Any] = {key: arrays[key] for key in _CAMERA if key in arrays}
     if "lens" in given:
         if given["lens"].size != 1 or given["lens"].dtype.kind != "U":
@@ -392,8 +412,11 @@ def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> T
         if keys[name] in arrays:
             array = _shaped(arrays, keys[name], (count, *shape), text=kind is str)
             found[name] = array if kind is str else array.astype(kind)
+    name, joints = keys["joints_m"], found["joints_m"]
+    # A hand that is not visible may be nowhere.
+    nowhere = ~found["visible"][:, None, None] & ~np.isfinite(joints)
+    found["joints_m"] = np.where(nowhere, np.float32(0), joints)
     if not np.isfinite(found["joints_m"]).all():
-        name = keys["joints_m"]
         raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
     return Truth(**found)
 

@@ -8,6 +8,7 @@ ones. What is read of each message stands in `ros_messages.py`.
 from __future__ import annotations
 
 import importlib
+import os
 from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -104,7 +105,7 @@ def read_rosbag(
     installed, the bag is damaged, it has no depth images or several topics of them, or nothing
     tells their lens; one sentence.
     """
-    path = Path(path).expanduser()
+    path = Path(os.path.expanduser(path))
     if not path.exists():
         raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
     unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import os
 from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
@@ -76,10 +77,29 @@ def open_recording(
     `.h5`, `.mat`), or of a suffix that an installed package reads (docs/extending.md).
     camera_file, bare: of what has no camera of its own, and says nothing of itself.
     modulation_mhz: tells the range of a `.srs` that does not state it.  topic: of a ROS bag that
-    has several of depth images. Raises
-    ToftrackError: it cannot be used; one sentence that names it.
+    has several of depth images. Raises ToftrackError: it cannot be used, or it says itself what is
+    given; one sentence that names it. A lens that is given goes before its own.
     """
-    path = Path(path).expanduser()
+    store = _opened(path, camera_file, modulation_mhz, topic, bare)
+    given = ("unit_m", "--source-unit", store.unit_m), ("fps", "--fps", store.fps)
+    for name, option, own in given:
+        if getattr(bare, name) not in (None, own):
+            raise ToftrackError(
+                f"'{path}' says its {name} itself; leave device.{name} (convert: {option}) out"
+            )
+    if lens := bare.camera(store.camera.width, store.camera.height):
+        store.camera = lens
+    return store
+
+
+def _opened(
+    path: str | Path,
+    camera_file: str | Path | None,
+    modulation_mhz: int,
+    topic: str | None,
+    bare: BareFacts,
+) -> FrameStore:
+    path = Path(os.path.expanduser(path))
     suffix = path.suffix.lower()
     with reading(path):  # too long a name
         is_folder = path.is_dir()
@@ -107,7 +127,7 @@ def open_recording(
             if stream.read(2) != b"PK":
                 kind = f"that end with {suffix}" if suffix else "without an ending"
                 raise ToftrackError(f"'{path}' is not read, as are no files {kind}; give {_READ}")
-    return read_recording(path)
+    return read_recording(path, camera_file, bare)
 
 
 def open_source(name: str) -> FrameStore:

@@ -166,12 +166,11 @@ def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: st
         axes.plot(time_s, error_mm.mean(1), ".-", color=chart.BLUE, label="mean of the joints")
         chart.round_log_ticks(axes, "y")
         axes.set_xlim(*_span(time_s))
-        axes.legend(loc="upper left", ncols=2)
+        axes.legend(loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
     _draw_score(below, run, score)
     if truth is not None:
-        absent = ~(truth.visible & truth.in_space)
-        name = "no hand of the known poses, says the truth"
-        chart.shade(below, time_s, absent, chart.GREY, name, top=0.96)
+        name = "no hand is visible, says the truth"
+        chart.shade(below, time_s, ~truth.visible, chart.GREY, name, top=0.96)
     round_numbers = MaxNLocator(10, integer=True).tick_values(run.frames[0], run.frames[-1])
     at = np.flatnonzero(np.isin(run.frames, round_numbers))
     _number_frames(below, time_s[at], run.frames[at])
@@ -184,7 +183,7 @@ def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: st
         else "The error is left out where the truth has no visible hand."
     )
     title = f"Score of {len(run)} frames"
-    if (mean := metrics.get("mean_mm")) is not None:
+    if (mean := metrics.get("trust", {}).get("mean_mm")) is not None:  # of frames that are not lost
         height = float(np.nanmean(score))
         title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {height:.2f}"
     return chart.titled(chart.picture_of(figure), of + title, note)
