@@ -208,6 +208,7 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("K", np.full((3, 3), np.nan), "NaN"),
         ("joints_m", np.zeros((T, 20, 3)), ""),
         ("joints_m", np.full((T, 21, 3), np.nan), ""),
+        ("joints_m", np.full((T, 21, 3), 400.0), "millimetres"),
         ("visible", np.ones(T + 1, bool), ""),
         ("amplitude", np.ones((T, H, W - 1), np.uint16), ""),
         ("timestamp_s", np.arange(T - 1.0), ""),

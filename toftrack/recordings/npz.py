@@ -418,6 +418,8 @@ def _truth_of_one(arrays: dict[str, Any], count: int, keys: dict[str, str]) -> T
     found["joints_m"] = np.where(nowhere, np.float32(0), joints)
     if not np.isfinite(found["joints_m"]).all():
         raise ToftrackError(f"'{name}' contains NaN or infinity; leave it out or repair it")
+    if np.median(np.abs(joints)) > LARGEST_MEDIAN_M:
+        raise ToftrackError(f"'{name}' is plainly in millimetres; divide it by 1000")
     return Truth(**found)
 
 
