@@ -13,7 +13,7 @@ from toftrack.compute.threads import run_shared
 
 _FAR = np.float32(np.inf)
 """The depth beyond the image's rows, which no reading is near to; and a gap larger than any."""
-_ROWS, _WORTH_A_THREAD = 64, 100_000
+_ROWS, _WORTH_A_THREAD = 64, 400_000
 """Rows that a thread looks at in one go; and pixels for which it pays to wake a second one."""
 
 
