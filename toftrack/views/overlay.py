@@ -249,7 +249,7 @@ def _caption(estimates: Sequence[Estimate], half_width: int) -> np.ndarray:
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), SLOT_RGB[slot][::-1], -1)
         cv2.rectangle(half, (8, 10), (28, CAPTION_PX - 10), _WHITE, 1)
         reported = _state(one) if one.lost else gesture_words(one) or _state(one)
-        facts = [reported, side_words(one), confidence_words(one.confidence)]
+        facts = [reported, confidence_words(one.confidence), side_words(one)]
         facts = ["no hand"] if is_vacant(one) else facts
         _write_line(half, facts if slot else [number, *facts], 38)
     return np.vstack([np.hstack(halves[row : row + 2]) for row in range(0, count, 2)])
