@@ -6,7 +6,7 @@
     python docs/make_figures.py --tables          write the tables only
     python docs/make_figures.py --strangers       track the public test set, append to history.md
     python docs/make_figures.py --in-turn FILE    take the times, measure nothing
-    python docs/make_figures.py --real NAME=FILE  take what measure.py measured of real recordings
+    python docs/make_figures.py --real NAME=FILE,FILE  take what measure.py measured, a file a seed
 
 The first measures the sample, tests/data/guards and tests/data/empty; with the recordings that
 tests/data/kinect2/make_extract.py and tests/data/stills/make_extract.py make, the labelled images;
@@ -79,7 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     what.add_argument("--tables", action="store_true", help="measure nothing")
     what.add_argument("--in-turn", type=Path, metavar="FILE", help="of benchmark alternating")
     about = "at hand, away or rooms, and the JSON of tests/data/real/measure.py"
-    what.add_argument("--real", metavar="NAME=FILE", help=about)
+    what.add_argument("--real", metavar="NAME=FILE,FILE", help=about)
     parser.add_argument("--kinect2", type=Path, metavar="FILE", help="the real recording")
     parser.add_argument("--stills", type=Path, metavar="FILE", help="the real stills")
     parser.add_argument("--sets", type=Path, metavar="DATA", help="the sets to develop on")
@@ -111,18 +111,18 @@ def _measured(options: argparse.Namespace) -> dict[str, Any]:
 
 def _real(name: str, file: str) -> dict[str, Any]:
     """The row of real recordings: means over those with truth, weighted by their frames; of the
-    others how many frames are flagged. FILE is what tests/data/real/measure.py --json wrote."""
-    from toftrack.evaluation.results import circumstances
-
-    found = json.loads(Path(file).read_text(encoding="utf-8"))
-    true = [row for row in found.values() if "usable_pct" in row]
-    row = _about(circumstances() | {"seeds": [0], "side": "told"})
+    others how many frames are flagged. `file` has what tests/data/real/measure.py --json wrote, a
+    file a seed, with commas between."""
+    several = [json.loads(Path(one).read_text(encoding="utf-8")) for one in file.split(",")]
+    found = [one for several_rows in several for one in several_rows["rows"].values()]
+    true = [row for row in found if "usable_pct" in row]
+    row = _about(several[0]["about"] | {"seeds": [one["about"]["seed"] for one in several]})
     if not true:  # rooms without a hand
         lost = [
             one.get("flagged", sum(shown.endswith(": lost") for shown in one.get("called", ())))
-            for one in found.values()
+            for one in found
         ]
-        row["frames"] = sum(one.get("frames", one.get("images")) for one in found.values())
+        row["frames"] = sum(one.get("frames", one.get("images")) for one in found)
         row["called_pct"] = round(100 * (1 - sum(lost) / row["frames"]), 2)
         return {name: row}
     row["frames"] = sum(one["frames"] for one in true)
@@ -131,9 +131,10 @@ def _real(name: str, file: str) -> dict[str, Any]:
         row[key] = round(
             sum(n * one[key] for n, one in zip(said, true, strict=True)) / sum(said), 2
         )
-    for one in found.values():
-        if "usable_pct" not in one and "flagged" in one:
-            row["thing_flagged_pct"] = round(100 * one["flagged"] / one["frames"], 1)
+    things = [one for one in found if "usable_pct" not in one and "flagged" in one]
+    if things:
+        flagged, frames = (sum(one[key] for one in things) for key in ("flagged", "frames"))
+        row["thing_flagged_pct"] = round(100 * flagged / frames, 1)
     return {name: row}
 
 

@@ -96,7 +96,7 @@ def shown_again_and_again(
             shape = hand.shape.of_side(side) if side != hand.shape.side else hand.shape
             estimate = replace(hand.estimate, index=count)
             shown = with_hand(moment, estimate=estimate, shape=shape)
-            view.show(replace(shown, side_given=asked != "auto"))
+            view.show(replace(shown, told=None if asked == "auto" else asked))
             stop.wait(0.02)
 
     thread = threading.Thread(target=run)

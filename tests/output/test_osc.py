@@ -12,7 +12,7 @@ from helpers.hands import hand_estimate, lost_hand
 from helpers.settings import part
 
 from toftrack.errors import ToftrackError
-from toftrack.frames.estimate import Estimate
+from toftrack.frames.estimate import Estimate, no_estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.osc import OscStream
@@ -59,6 +59,25 @@ def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> Non
     }
     gone = replace(hand_estimate(3), lost=True)
     assert set(sent(receiver, gone)) == {"/toftrack/frame", "/toftrack/right/tracked"}
+
+
+def test_a_hand_of_which_nothing_is_said_any_more_is_told_lost_once(
+    receiver: socket.socket,
+) -> None:
+    host, port = receiver.getsockname()
+    both, vacant = (
+        (hand_estimate(0), hand_estimate(0, "left")),
+        no_estimate(1, 0.04, "lost", 4, 0.0),
+    )
+    said = []
+    with osc_stream(host=host, port=port) as stream:
+        for estimates in (both, (vacant, vacant), (vacant, vacant)):
+            stream.send(estimates)
+            bundle = {one.address: one.params for one in OscBundle(receiver.recv(65535))}
+            said.append({key: value for key, value in bundle.items() if key.endswith("tracked")})
+    assert said[0] == {"/toftrack/right/tracked": [1], "/toftrack/left/tracked": [1]}
+    assert said[1] == {"/toftrack/right/tracked": [0], "/toftrack/left/tracked": [0]}
+    assert said[2] == {}
 
 
 def test_landmarks_and_the_joints_of_openxr_are_reported_on_demand(receiver: socket.socket) -> None:

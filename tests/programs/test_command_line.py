@@ -253,6 +253,22 @@ def test_help_of_a_module_that_is_run_is_no_error(words: str) -> None:
     assert done.returncode == 0 and "usage: python -m toftrack.training" in done.stdout
 
 
+@pytest.mark.parametrize(("closed", "status"), [("0<&-", 0), ("2>&-", 0), ("1>&-", 1)])
+def test_a_program_runs_with_closed_streams_but_streams_to_none(
+    closed: str, status: int, tmp_path: Path
+) -> None:
+    stream = "stream=stdout" if status else "stream=none"
+    words = f"{sys.executable} -m toftrack track {stream} view=none device.stop=2 experiment=paper"
+    command = ["sh", "-c", f"{words} hydra.run.dir={tmp_path}/run {closed}"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == status, done.stderr
+    assert (len(done.stderr.splitlines()) > 0) == (closed != "2>&-")
+    if status:
+        assert "standard output cannot be used (it is closed)" in done.stderr
+    else:
+        assert json.loads((tmp_path / "run" / "summary.json").read_text())["frames"] == 2
+
+
 def test_a_cause_deep_inside_is_what_is_reported() -> None:
     try:
         try:

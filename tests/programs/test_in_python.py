@@ -130,6 +130,8 @@ def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:
     ended.end()
     with pytest.raises(toftrack.ToftrackError, match="no frame"):
         toftrack.track(ended, *PAPER).results()
+    with pytest.raises(toftrack.ToftrackError, match="fps=0 is not possible"):
+        toftrack.PushDevice(Sample().camera, 0)
 
 
 def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:

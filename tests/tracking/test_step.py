@@ -50,11 +50,20 @@ def same(one: Estimate, two: Estimate) -> bool:
 
 @pytest.mark.parametrize(
     ("index", "timestamp_s"),
-    [("a", 0.0), (0, "soon"), (0, 1j), (0, [0.1]), (math.nan, 0.0), (0, 10**400)],
+    [
+        ("a", 0.0),
+        (0, "soon"),
+        (0, 1j),
+        (0, [0.1]),
+        (math.nan, 0.0),
+        (0, 10**400),
+        (-1, 0.0),
+        (2.5, 0),
+    ],
 )
 def test_a_number_and_a_time_that_are_none_are_refused(index: Any, timestamp_s: Any) -> None:
     tracker, scene = quick(), sample()
-    with pytest.raises(ToftrackError, match="a whole number and seconds"):
+    with pytest.raises(ToftrackError, match="a whole number from 0 on and seconds"):
         tracker.step(scene.depth_m[0], scene.k, index, timestamp_s)
 
 

@@ -192,7 +192,7 @@ def _say_once(error: Exception) -> None:
 def _announce(dispatcher: Any) -> None:
     """Say once a process that a kernel is compiled, unless it is only loaded."""
     folder = dispatcher.stats.cache_path
-    if "compiling" not in _said and not (folder and any(os.scandir(folder))):
+    if "compiling" not in _said and not (folder and os.listdir(folder)):
         _said.add("compiling")
         often = "once on a machine" if folder else "in every run"
         log.info(f"compiling kernels ({often}, for up to a minute)")

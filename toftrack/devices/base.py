@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Self
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame, Truth
 
@@ -15,6 +15,8 @@ class BaseDevice:
 
     Derive from it, write `__iter__`, and `open` and `close` where needed; `open` and the iteration
     raise ToftrackError when the device cannot deliver.
+
+    fps: frames a second, above 0: what it delivers, or what is expected of it.
     """
 
     def __init__(
@@ -25,6 +27,7 @@ class BaseDevice:
         truth: Truth | None = None,
         live: bool = False,
     ) -> None:
+        check_number("fps", fps, 0, above=True)
         self.camera, self.fps = camera, float(fps)
         """Of the images; what the overlay video plays at."""
         self.frames, self.truth = frames, truth

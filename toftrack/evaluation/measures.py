@@ -26,9 +26,8 @@ in the pose space, from frame `SKIPPED` on. Frames flagged lost count like any o
 flagging cannot improve an error. Frames without an estimate are failures: `missing_pct`, left out
 of means and quantiles, never good. Its other figures:
 
-- Lost detection: a frame is lost, in truth, when the hand is not visible or not in the pose space.
-  The tolerant figures leave out the frames within `TOLERANCE` frames of a change of that truth; the
-  strict ones do not.
+- Lost detection: a frame is lost, in truth, when the hand is not visible. The tolerant figures
+  leave out the frames within `TOLERANCE` frames of a change of that; the strict ones do not.
 - Re-acquisition: frames from an event to the first of `RIGHT_FRAMES` consecutive ones (fewer at the
   end) that are not flagged lost and have a mean error below `RIGHT_MM`; None when that does not
   happen before the hand is gone again. Events: `return`, the hand becomes visible again; `entered`,
@@ -265,9 +264,9 @@ def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, 
         f"frames_max_below_{OK_MM:g}mm_pct": share_pct(error.max(1) < OK_MM, used) or 0.0,
         "mean_not_lost_mm": figure(error[measured & ~flagged]),
     }
-    clear = counted & ~_near_change(present)
+    clear = counted & ~_near_change(of.seen)
     for suffix, rows in (("", clear), ("_strict", counted)):
-        said, gone = flagged[rows], ~present[rows]
+        said, gone = flagged[rows], ~of.seen[rows]
         metrics[f"lost_precision{suffix}"] = figure(gone[said])
         metrics[f"lost_recall{suffix}"] = figure(said[gone])
     found = runs(of.said & (of.mean_mm < RIGHT_MM), RIGHT_FRAMES, cut=True)
@@ -278,10 +277,10 @@ def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, 
     return metrics
 
 
-def _near_change(present: np.ndarray) -> np.ndarray:
-    """(T,) bool: at most `TOLERANCE` frames lie between the frame and a change of `present`."""
-    near = np.zeros(len(present), bool)
-    for change in np.flatnonzero(np.diff(present)) + 1:  # first frame of the new value
+def _near_change(seen: np.ndarray) -> np.ndarray:
+    """(T,) bool: at most `TOLERANCE` frames lie between the frame and a change of `seen`."""
+    near = np.zeros(len(seen), bool)
+    for change in np.flatnonzero(np.diff(seen)) + 1:  # first frame of the new value
         near[max(0, change - TOLERANCE) : change + TOLERANCE] = True
     return near
 

@@ -154,14 +154,14 @@ def totals(rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _means(each: Sequence[Row], keys: Sequence[str]) -> dict[str, Any]:
-    """Of recordings, with intervals; of one recording, of shares alone."""
+    """Of recordings, with intervals where there are several."""
     found: dict[str, Any] = {}
     for key in keys:
         values = [row[key] for row in each if row.get(key) is not None]
         if values:
             share = interval(values)
             found[key] = rounded(share.mean)
-            if len(values) > 1 or key in SHARES:
+            if len(values) > 1:
                 found[interval_name(key)] = [rounded(share.low), rounded(share.high)]
     return found
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import math
 from dataclasses import dataclass, replace
@@ -144,14 +145,15 @@ class DepthImage:
 
 
 def checked_moment(index: Any, timestamp_s: Any) -> tuple[int, float]:
-    """A frame's number and its seconds; ToftrackError where they are no numbers."""
-    try:
-        return int(index), float(timestamp_s)
-    except (TypeError, ValueError, OverflowError):
-        raise ToftrackError(
-            f"the frame's index and timestamp_s must be a whole number and seconds, but are "
-            f"{index!r} and {timestamp_s!r}"
-        ) from None
+    """A frame's number, from 0 on, and its seconds; ToftrackError where they are none."""
+    with contextlib.suppress(TypeError, ValueError, OverflowError):
+        number, seconds = int(index), float(timestamp_s)
+        if number == index and number >= 0:
+            return number, seconds
+    raise ToftrackError(
+        f"the frame's index and timestamp_s must be a whole number from 0 on and seconds, but are "
+        f"{index!r} and {timestamp_s!r}"
+    )
 
 
 def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:

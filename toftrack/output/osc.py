@@ -55,11 +55,17 @@ class OscStream(UdpStream):
         )
         more = (name for part in self._parts for name in _FIELDS_OF[part])
         self._names = (*_FIELDS, *more)
+        self._tracked: set[str] = set()
 
     def datagram(self, estimates: Sequence[Estimate]) -> bytes:
         """The bundle, to be acted upon at once."""
         bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
-        for address, arguments in messages(line_content(estimates, self._names), self._parts):
+        said = list(messages(line_content(estimates, self._names), self._parts))
+        # Of a hand of which nothing is said any more, a receiver would hold the last word for ever.
+        told = {address: bool(one[0][1]) for address, one in said if address.endswith("/tracked")}
+        said += [(address, [("i", 0)]) for address in sorted(self._tracked - told.keys())]
+        self._tracked = {address for address, tracked in told.items() if tracked}
+        for address, arguments in said:
             message = self._messages.OscMessageBuilder(address)
             for kind, value in arguments:
                 message.add_arg(value, kind)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,13 +42,13 @@ class Run:
     """A finished run: T frames, a row for each; see `read_run`."""
 
     folder: Path
-    results: dict[str, Any]
+    results: dict[str, Any] = field(repr=False)
     """Of `read_results`: the arrays of track.npz, `joint_names` and `metadata`."""
-    frames: np.ndarray
+    frames: np.ndarray = field(repr=False)
     """(T,) int64 numbers of the input frames."""
-    summary: dict[str, Any]
+    summary: dict[str, Any] = field(repr=False)
     """Of summary.json."""
-    shapes: tuple[HandShape, ...]
+    shapes: tuple[HandShape, ...] = field(repr=False)
     """The hands at the end of the run, one a slot."""
 
     def __len__(self) -> int:
@@ -73,7 +73,7 @@ class Run:
     def camera(self) -> Camera:
         """The camera of the run, whose undistorted image the joints belong to."""
         about = self.results["metadata"].get("camera")
-        known = {field.name for field in fields(Camera)}
+        known = {one.name for one in fields(Camera)}
         if not isinstance(about, dict) or not {"K", "width", "height"} <= about.keys():
             raise ToftrackError(f"the run in '{self.folder}' does not say with which camera it was")
         return Camera(**{name: value for name, value in about.items() if name in known})
@@ -174,9 +174,9 @@ class Run:
         if target != f"{kind.__module__}.{kind.__qualname__}":
             raise self._of_its_own(group, target)
         # JSON has no word for infinity: a number that is null was one.
-        for field in fields(kind):
-            if field.type == "float" and settings.get(field.name, 0.0) is None:
-                settings[field.name] = math.inf
+        for one in fields(kind):
+            if one.type == "float" and settings.get(one.name, 0.0) is None:
+                settings[one.name] = math.inf
         with reported_errors(
             f"the {group} of the run in '{self.folder}' is of another version",
             "run track.py again with this one",

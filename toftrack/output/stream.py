@@ -6,6 +6,7 @@ dropped, counted, and reported at the end.
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import select
@@ -82,8 +83,9 @@ class StdoutStream(Stream):
         with reported_errors(
             "standard output cannot be used", "with stream=stdout, give it a pipe or a file"
         ):
-            if sys.stdout is not None:
-                sys.stdout.flush()
+            if sys.stdout is None:
+                raise OSError(errno.EBADF, "it is closed")
+            sys.stdout.flush()
             self._descriptor = self._stdout = os.dup(_STDOUT)
         if os.isatty(_STDOUT):  # whose room nothing tells
             with suppress(OSError):  # it has no name here

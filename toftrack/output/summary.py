@@ -121,20 +121,20 @@ def run_metrics(
     known = counted & inside
     if not known.any():
         return None
-    position = np.flatnonzero(counted[inside])
+    numbers = index[known]
     found = truth.of_frames(index[known])
     done = {field.name: records.column(field.name, rows[known]) for field in fields(Estimates)}
     estimates = Estimates(**found_side(done))
     both = measured(estimates, found)
     if both.slots is None:
-        return _metrics(both.first, estimates, found, position)
-    first = _metrics(both.first, estimates.slot(both.slots[0]), found, position)
+        return _metrics(both.first, estimates, found, numbers)
+    first = _metrics(both.first, estimates.slot(both.slots[0]), found, numbers)
     metrics = {"slot": both.slots[0]} | first
     if both.ghost_pct is not None:
         metrics["ghost_pct"] = both.ghost_pct
     if both.second is None or found.other is None:
         return metrics
-    second = _metrics(both.second, estimates.slot(both.slots[1]), found.other, position)
+    second = _metrics(both.second, estimates.slot(both.slots[1]), found.other, numbers)
     return metrics | {"second": {"slot": both.slots[1]} | second}
 
 
@@ -147,12 +147,12 @@ def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _metrics(
-    of: Measured, estimates: Estimates, truth: Truth, position: np.ndarray
+    of: Measured, estimates: Estimates, truth: Truth, numbers: np.ndarray
 ) -> dict[str, Any]:
-    """Of one hand; position: (T,) of the frames among all, with those that do not count."""
+    """Of one hand; numbers: (T,) of the frames, as the recording counts them."""
     metrics = {"trust": asdict(of.trust)} | evaluate(estimates.joints_m, estimates.lost, truth)
     for event in metrics["reacquisition"]:
-        event["frame"] = int(position[event["frame"]])
+        event["frame"] = int(numbers[event["frame"]])
     metrics["coverage"] = {name: of.figures.get(name) for name in REGION_FIGURES}
     further = {name: value for name, value in of.figures.items() if name not in REGION_FIGURES}
     return metrics | {"further": further}

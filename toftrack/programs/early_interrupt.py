@@ -1,4 +1,5 @@
-"""Ctrl-C while a program still loads: imported before everything else, by programs alone.
+"""Ctrl-C while a program still loads, and streams that are closed: imported before everything else,
+by programs alone.
 
 Within the first second nothing is written yet, and an exception would end in whatever is being
 imported: so the process ends at once, with status 130. `programs.shutdown` takes over when the
@@ -9,6 +10,7 @@ is done Ctrl-C does nothing any more: its status is known.
 import atexit
 import os
 import signal
+import sys
 from types import FrameType
 
 
@@ -16,6 +18,12 @@ def _end(number: int, frame: FrameType | None) -> None:
     os.write(2, b"interrupted\n")
     os._exit(128 + number)
 
+
+for stream in (sys.stdin, sys.stdout, sys.stderr):
+    if stream is None:  # closed: else the next file that is opened takes its descriptor
+        os.open(os.devnull, os.O_RDWR)
+if sys.stderr is None:  # what is said there is for nobody, and must not come out elsewhere
+    sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # until the end
 
 if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # it may be ignored, as by nohup
     signal.signal(signal.SIGINT, _end)

@@ -201,6 +201,9 @@ def _table(groups: Sequence[Group], figure: str) -> str:
         for number, group in enumerate(groups, 1):
             cells = [_text(group.recordings.get(name), digits) for name in names]
             lines.append(f"{number:2d}  " + " ".join(f"{cell:>{width}}" for cell in cells))
+    done = [run for group in groups for run in group.runs if run.error is None]
+    if without := sum(figure not in run.figures for run in done):
+        lines.append(f"{without} of {len(done)} runs have no {figure}; the means are without them")
     return "\n".join(lines)
 
 

@@ -232,8 +232,8 @@ class Run:
         hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
         told = self._told()
         advice = self.watch.advice(told, recent=True)
-        given, dropped = told is not None, device.dropped
-        tracked = TrackedFrame(frame, depth, device.camera, hands, given, advice, dropped)
+        shown = hands, told, advice, device.dropped
+        tracked = TrackedFrame(frame, depth, device.camera, *shown)
         view.show(tracked)
         if device.live:
             took_s, reduced = tracker.time.took_s(), tracker.time.reduced

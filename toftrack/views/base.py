@@ -41,8 +41,8 @@ class TrackedFrame:
     camera: Camera
     hands: tuple[TrackedHand, ...]
     """One for each slot."""
-    side_given: bool = False
-    """The first hand's side is told, and not detected."""
+    told: str | None = None
+    """The first hand's side as it was told; None = it is detected."""
     advice: tuple[str, ...] = ()
     """What to try, where the frames before this one hardly showed a hand, or the other one."""
     dropped: int = 0

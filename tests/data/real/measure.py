@@ -23,6 +23,7 @@ import numpy as np
 
 from toftrack.api import make_hands_tracker
 from toftrack.evaluation.image_labels import Points, point_rows, read_labels
+from toftrack.evaluation.results import circumstances
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, trust
 from toftrack.frames.frame import Truth
 from toftrack.training.fit_confidence import reliability_figure
@@ -72,7 +73,9 @@ def main() -> None:
         if asked.picture is not None:
             write_picture(asked.picture, reliability_figure(*reliability, "joints"))
     if asked.json is not None:
-        asked.json.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        about = circumstances() | {"seed": int(asked.seed), "side": asked.side}
+        written = json.dumps({"about": about, "rows": rows}, indent=1)
+        asked.json.write_text(written + "\n", encoding="utf-8")
 
 
 def _tracked(kept: dict[str, np.ndarray], settings: list[str]) -> list[Any]:

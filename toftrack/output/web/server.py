@@ -300,10 +300,11 @@ class WebServer:
 
     def _is_called_by_name(self, host_header: str) -> bool:
         """Whether a request calls this machine by an address, as localhost, or as `host`."""
-        name = urlsplit(f"//{host_header}").hostname or ""
+        name = ""
         try:
+            name = urlsplit(f"//{host_header}").hostname or ""
             ipaddress.ip_address(name)
-        except ValueError:
+        except ValueError:  # no address, or no host at all
             return name in ("localhost", self._host.lower())
         return True
 

@@ -273,7 +273,7 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
         "advice": list(tracked.advice),
     }
     if len(tracked.hands) == 1:
-        side = {"side": first.shape.side, "side_given": tracked.side_given}
+        side = {"side": first.shape.side, "told": tracked.told}
         return of_frame | _hand_facts(first) | side
     return of_frame | {
         "state": state_words(first.estimate),

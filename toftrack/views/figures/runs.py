@@ -183,9 +183,11 @@ def course_figure(run: Run, truth: Truth | None, metrics: dict[str, Any], of: st
         else "The error is left out where the truth has no visible hand."
     )
     title = f"Score of {len(run)} frames"
-    if (mean := metrics.get("trust", {}).get("mean_mm")) is not None:  # of frames that are not lost
+    if (mean := metrics.get("trust", {}).get("mean_mm")) is not None:
         height = float(np.nanmean(score))
-        title = f"{len(run)} frames: mean joint error {mean:.1f} mm, mean score {height:.2f}"
+        title = (
+            f"{len(run)} frames: mean joint error {mean:.1f} mm where not lost, score {height:.2f}"
+        )
     return chart.titled(chart.picture_of(figure), of + title, note)
 
 
