@@ -172,6 +172,8 @@ class UdpStream(Stream):
             self._socket.sendto(self.datagram(estimates), self._address)
         except OSError as error:  # its buffer is full, or there is no network just now
             self.dropped += 1
+            if error.errno == errno.EMSGSIZE and not self._reason:
+                _log.warning("a frame is too long for a datagram; give fewer stream.fields")
             self._reason = error.strerror or str(error)
         else:
             self.sent += 1

@@ -21,6 +21,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, evaluate, measured
 from toftrack.evaluation.statistics import text_of
+from toftrack.evaluation.trust import RIGHT_FRAMES
 from toftrack.frames.frame import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.output.records import Records
@@ -265,7 +266,9 @@ def _trust_rows(trust: dict[str, Any]) -> list[tuple[str, str]]:
     usable, alarms = (
         text_of(trust[name] if seen else None) for name in ("usable_pct", "false_alarm_pct")
     )
-    right = "never" if first is None else f"in frame {first}"
+    short = trust["frames"] < RIGHT_FRAMES
+    never = f"- (of {RIGHT_FRAMES} frames in a row)" if short else "never"
+    right = never if first is None else f"in frame {first}"
     partly = (
         f"; in {text_of(trust['partly_pct'])} % some joints are over 40 mm off, their mean is not"
     )
