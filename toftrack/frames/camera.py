@@ -10,6 +10,7 @@ import json
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -125,8 +126,11 @@ class Camera:
             raise ToftrackError(
                 "the camera matrix K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew"
             )
-        if int(self.width) < 1 or int(self.height) < 1:
-            raise ToftrackError(f"the image size {self.width}x{self.height} is not positive")
+        for size in (self.width, self.height):
+            if not isinstance(size, Real) or not 1 <= size < math.inf or size % 1:
+                raise ToftrackError(
+                    f"the image size {self.width}x{self.height} is not of two whole numbers above 0"
+                )
         _check_plausible(K, int(self.width), int(self.height))
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "width", int(self.width))

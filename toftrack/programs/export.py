@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import io
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -57,6 +58,9 @@ def _contents(run: Run, kind: str) -> dict[str, bytes]:
     if kind == "csv":
         return {"hand.csv": csv_of(run.results).encode()}
     motions = motions_of(run.results, run.shapes)
+    steps_s = np.diff(motions[0].time_s)
+    if kind == "bvh" and len(steps_s) and steps_s.max() > 1.5 * np.median(steps_s):
+        print("note: frames are not evenly spaced, which a .bvh cannot say", file=sys.stderr)
     if kind == "glb":
         return {"hand.glb": glb_of(motions)}
     if len(run.shapes) == 1:
