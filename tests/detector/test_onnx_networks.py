@@ -69,7 +69,9 @@ def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weight
     for count in (1, 4):
         crops = torch.rand(count, CROP_CHANNELS, CROP, CROP, generator=draw)
         expected = pose.reference.features(crops)
-        for one, two in zip(pose.outputs(crops.numpy()), expected, strict=False):
+        outputs = pose.outputs(crops.numpy())
+        assert len(outputs) == 3
+        for one, two in zip(outputs, expected, strict=False):
             away = torch.from_numpy(one) - two
             assert 0 < away.square().mean().sqrt() < 0.1 * two.std()
     for size in ((1, 2, 16, 16), (2, 2, 80, 48)):

@@ -56,6 +56,7 @@ def test_a_recording_gives_what_the_sdk_recorded(recording: Path, images: np.nda
         np.testing.assert_allclose(frame.depth, images[0, number] / 1000, rtol=1e-6)
         np.testing.assert_array_equal(frame.amplitude, images[1, number])
         assert frame.timestamp_s == pytest.approx(1 + number / 30, abs=1e-5)
+    assert missed + frames[-1].index == len(images[0]) - 1, "to the end"
 
 
 def test_what_is_no_recording_is_reported(tmp_path: Path, recording: Path) -> None:

@@ -133,6 +133,8 @@ def test_the_interval_holds_the_mean() -> None:
     share = interval([10.0, 20.0, 90.0])
     assert share.low < share.mean == 40 < share.high
     assert interval([50.0] * 4) == (50, 50, 50)
+    many = interval(list(range(100)))  # 90 %: 1.645 standard errors of 2.89 on either side
+    assert (many.low, many.high) == pytest.approx((44.75, 54.25), abs=0.4)
 
 
 def test_runs() -> None:

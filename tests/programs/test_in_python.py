@@ -106,6 +106,7 @@ def test_the_device_is_closed_however_the_loop_ends() -> None:
                 assert camera.opened == 1
                 if leaves and estimate.index == 1:
                     raise ZeroDivisionError
+            assert fails is None and not leaves
         except (ZeroDivisionError, toftrack.ToftrackError) as error:
             assert leaves or "unplugged" in str(error)
         assert camera.opened == 0

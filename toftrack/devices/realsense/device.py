@@ -239,7 +239,7 @@ def choose_streams(
     rs: ModuleType, device: Any, size: Size, infrared: bool, owner: str
 ) -> tuple[Any, Any, Any | None]:
     """A device's depth sensor, and the profiles of its depth images and, if asked for and there, of
-    the infrared images on the same pixels.  size, owner, errors: as for `chosen_profile`.
+    the infrared images on the same pixels.  size, owner: as for `chosen_profile`.
     """
     sensor, profiles, offered = None, [], []
     for sensor in device.query_sensors():
