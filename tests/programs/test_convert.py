@@ -109,6 +109,9 @@ def test_the_lens_goes_before_an_npz_s_own_and_other_facts_stand_in_for_missing_
     convert.convert(tmp_path / "whole.npz", tmp_path / "other.npz", bare=replace(lens, fps=None))
     other = read_recording(tmp_path / "other.npz")
     assert (other.camera.K[0, 0], other.fps) == (30, pytest.approx(10))
+    Camera(np.diag((9.0, 9, 1)), 9, 6).save(tmp_path / "wide.json")
+    with pytest.raises(ToftrackError, match="9x6 pixels, but the recording has 8x6"):
+        convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz", tmp_path / "wide.json")
     with pytest.raises(ToftrackError, match="key 'K'.*--intrinsics"):
         convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz")
 

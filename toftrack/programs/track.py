@@ -232,8 +232,7 @@ class Run:
         hands = tuple(map(TrackedHand, estimates, shapes, tracker.insights))
         told = self._told()
         advice = self.watch.advice(told, recent=True)
-        shown = hands, told, advice, device.dropped
-        tracked = TrackedFrame(frame, depth, device.camera, *shown)
+        tracked = TrackedFrame(frame, depth, device.camera, hands, told, advice, device.dropped)
         view.show(tracked)
         if device.live:
             took_s, reduced = tracker.time.took_s(), tracker.time.reduced

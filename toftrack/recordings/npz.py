@@ -364,7 +364,7 @@ def _camera_of(
     """The camera of images of that size, px: the file's, else the given one. ToftrackError."""
     if "K" not in arrays:
         if camera_file is not None:
-            return Camera.load(camera_file)
+            return Camera.load_for(camera_file, width, height, "the recording")
         if lens := bare.camera(width, height):
             return lens
         raise ToftrackError(
