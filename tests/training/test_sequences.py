@@ -2,21 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from helpers.detection import small_bank
 
-from toftrack.errors import ToftrackError
-from toftrack.training.sequences import (
-    CAMERAS,
-    Sequence,
-    random_sequence,
-    read_sequence,
-    write_sequence,
-)
+from toftrack.training.sequences import CAMERAS, Sequence, random_sequence
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -60,18 +51,3 @@ def test_a_seed_gives_the_same_recording() -> None:
     one, two, other = sequence(5, 2), sequence(5, 2), sequence(6, 2)
     assert np.array_equal(one.depth_m, two.depth_m) and np.array_equal(one.joints_m, two.joints_m)
     assert not np.array_equal(one.joints_m, other.joints_m)
-
-
-def test_a_kept_sequence_is_read_as_it_was(tmp_path: Path) -> None:
-    seen = sequence(0, frames=1)
-    write_sequence(tmp_path / "0.npz", seen)
-    again = read_sequence(tmp_path / "0.npz")
-    for name in ("depth_m", "k", "joints_m", "visible"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(seen, name))
-    assert again.side == seen.side
-
-
-def test_another_file_is_no_sequence(tmp_path: Path) -> None:
-    np.savez(tmp_path / "other.npz", depth=np.zeros(3))
-    with pytest.raises(ToftrackError, match="other.npz' holds no rendered sequence"):
-        read_sequence(tmp_path / "other.npz")

@@ -68,8 +68,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--frames", type=int, default=50, help="of each (50)")
     add("--seed", type=int, default=1, help="of everything random (1)")
     add("--output", type=Path, default=Path("confidence"), help="folder (confidence)")
-    kept = "track the sequences that an earlier run kept here, or render and keep them"
-    add("--sequences-from", type=Path, metavar="FOLDER", help=kept)
     return parser
 
 

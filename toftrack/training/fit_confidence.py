@@ -7,9 +7,8 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from tqdm import tqdm
 
 from toftrack.api import make_tracker
 from toftrack.errors import ToftrackError
-from toftrack.files.archives import write_archive
 from toftrack.files.safe_files import write_whole
 from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.tracking.confidence import (
@@ -32,7 +30,7 @@ from toftrack.tracking.confidence import (
     JointConfidence,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.training.sequences import Sequence, random_sequence, read_sequence, write_sequence
+from toftrack.training.sequences import Sequence, random_sequence
 from toftrack.training.shapes import shape_bank
 from toftrack.views.figures import chart
 from toftrack.views.pictures import write_picture
@@ -91,12 +89,17 @@ class Observed(NamedTuple):
 def fit_confidence(asked: argparse.Namespace) -> None:
     """Render, track, fit, report; asked: the arguments of fit-confidence."""
     asked.output.mkdir(parents=True, exist_ok=True)
-    count, sequences = _sequences(asked)
+    generator = torch.Generator().manual_seed(asked.seed)
+    bank = shape_bank(400, generator)
+    numbers = tqdm(range(asked.sequences), unit=" sequences", file=sys.stderr)
     parts = [
-        observed(sequence, asked.overrides, asked.seed + number, number)
-        for number, sequence in enumerate(
-            tqdm(sequences, total=count, unit=" sequences", file=sys.stderr)
+        observed(
+            random_sequence(asked.frames, bank, generator),
+            asked.overrides,
+            asked.seed + number,
+            number,
         )
+        for number in numbers
     ]
     seen = _together([part for part in parts if part is not None])
     kept = seen.sequence % _HELD_OUT == 0
@@ -117,35 +120,12 @@ def fit_confidence(asked: argparse.Namespace) -> None:
     write_whole(asked.output / "confidence.json", content + "\n")
     picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
     write_picture(asked.output / "reliability.png", picture)
-    arrays = {name: getattr(seen, name) for name in ("features", "right", "whole", "sequence")}
-    arrays |= {f"joint_{name}": values for name, values in seen.joints._asdict().items()}
-    write_archive(asked.output / "features.npz", arrays)
     print(
         f"{summary['frames']} frames, {100 * summary['right']:.0f} % right; held out: log loss"
         f" {summary['held_out_log_loss']:.3f}; 90 % regions hold"
         f" {summary['held_out_joints_in_90_pct_region']} % of the joints\n"
         f"lost.fitted={asked.output / 'confidence.json'}"
     )
-
-
-def _sequences(asked: argparse.Namespace) -> tuple[int, Iterator[Sequence]]:
-    """How many sequences, and one after the other."""
-    folder: Path | None = asked.sequences_from
-    files = [] if folder is None else sorted(folder.glob("*.npz"))
-    if files:
-        return len(files), (read_sequence(file) for file in files)
-    generator = torch.Generator().manual_seed(asked.seed)
-    bank = shape_bank(400, generator)
-
-    def rendered() -> Iterator[Sequence]:
-        for number in range(asked.sequences):
-            sequence = random_sequence(asked.frames, bank, generator)
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-                write_sequence(folder / f"{number:04d}.npz", sequence)
-            yield sequence
-
-    return asked.sequences, rendered()
 
 
 def _fitted_frames(

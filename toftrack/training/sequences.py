@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import roma
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
-from toftrack.files.archives import read_archive, write_archive
 from toftrack.training.dice import Dice
 from toftrack.training.hands import HAND, posed_hands, random_rotations, random_views
 from toftrack.training.images import FURNISHED, furnished, other_hands, random_scenes
@@ -103,30 +100,6 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         np.array(seen),
         "left" if bool(left) else "right",
     )
-
-
-def write_sequence(path: Path, sequence: Sequence) -> None:
-    """Keep a sequence as an npz file."""
-    arrays = {
-        "depth": sequence.depth_m,
-        "k": sequence.k,
-        "joints": sequence.joints_m,
-        "visible": sequence.visible,
-        "side": sequence.side,
-    }
-    write_archive(path, arrays)
-
-
-def read_sequence(path: Path) -> Sequence:
-    """A sequence that was kept. Raises ToftrackError where the file holds none."""
-    try:
-        kept = read_archive(path)
-        fields = (kept["depth"], kept["k"], kept["joints"], kept["visible"])
-        return Sequence(*fields, str(kept["side"]))
-    except (OSError, KeyError, ValueError) as error:
-        raise ToftrackError(
-            f"'{path}' holds no rendered sequence; give a folder that fit-confidence wrote"
-        ) from error
 
 
 def _places(keys: int, wide: float, high: float, dice: Dice) -> Tensor:
