@@ -25,30 +25,36 @@ _CAREFUL = np.float32(0.85)
 
 
 @compiled
-def _cone_distance(across, y, first, second, length, slope, rise):
-    """Of a round cone along y from 0 to `length`; slope, rise: sine and cosine of its opening."""
-    along = rise * y - slope * across
-    if along < 0:
-        return math.sqrt(across * across + y * y) - first
-    if along > rise * length:
-        return math.sqrt(across * across + (y - length) * (y - length)) - second
-    return across * rise + y * slope - first
+def _numbers(p, i):
+    """Of a hand's primitive number i, see skin.PRIMITIVE: read once, as a loop that writes arrays
+    would read them again and again.
+    """
+    return (
+        *(p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5], p[i, 6], p[i, 7], p[i, 8]),
+        *(p[i, 9], p[i, 10], p[i, 11], p[i, 12], p[i, 13], p[i, 14], p[i, 15], p[i, 16]),
+    )
 
 
 @compiled
-def _primitive_distance(p, i, x, y, z):
-    """Of a hand's primitive number i, see skin.PRIMITIVE."""
-    x, y, z = x - p[i, 0], y - p[i, 1], z - p[i, 2]
-    a = p[i, 3] * x + p[i, 4] * y + p[i, 5] * z
-    b = p[i, 6] * x + p[i, 7] * y + p[i, 8] * z
-    c = p[i, 9] * x + p[i, 10] * y + p[i, 11] * z
-    if p[i, 14] >= 0:
-        across = math.sqrt(a * a + c * c)
-        return _cone_distance(across, b, p[i, 12], p[i, 13], p[i, 14], p[i, 15], p[i, 16])
+def _distance(q, x, y, z):
+    """From a point to a primitive, see _numbers; each kind without branches, for vectors."""
+    x, y, z = x - q[0], y - q[1], z - q[2]
+    a = q[3] * x + q[4] * y + q[5] * z
+    b = q[6] * x + q[7] * y + q[8] * z
+    c = q[9] * x + q[10] * y + q[11] * z
+    if q[14] >= 0:
+        first, second, length, slope, rise = q[12], q[13], q[14], q[15], q[16]
+        square, beyond = a * a + c * c, b - length
+        across = math.sqrt(square)
+        along = rise * b - slope * across
+        start = math.sqrt(square + b * b) - first
+        end = math.sqrt(square + beyond * beyond) - second
+        side = across * rise + b * slope - first
+        return start if along < 0 else (end if along > rise * length else side)
     norm = math.sqrt(a * a + b * b + c * c)
-    gx = p[i, 3] * a + p[i, 6] * b + p[i, 9] * c
-    gy = p[i, 4] * a + p[i, 7] * b + p[i, 10] * c
-    gz = p[i, 5] * a + p[i, 8] * b + p[i, 11] * c
+    gx = q[3] * a + q[6] * b + q[9] * c
+    gy = q[4] * a + q[7] * b + q[10] * c
+    gz = q[5] * a + q[8] * b + q[11] * c
     return norm * (norm - _ONE) / (math.sqrt(gx * gx + gy * gy + gz * gz) + _TINY)
 
 
@@ -150,7 +156,7 @@ def _union(primitives, balls, on, count, x, y, z, wide):
         dx, dy, dz = x - balls[i, 0], y - balls[i, 1], z - balls[i, 2]
         far = union + wide + balls[i, 3]
         if dx * dx + dy * dy + dz * dz < far * far:
-            d = _primitive_distance(primitives, i, x, y, z)
+            d = _distance(_numbers(primitives, i), x, y, z)
             gap = wide - abs(union - d)
             union = min(union, d)
             if gap > 0:
@@ -178,7 +184,7 @@ def _sort_by_distance(primitives, on, count, x, y, z, near):
     """Primitives by their distances, `near`, from a point."""
     for k in range(count):
         i = on[k]
-        d = _primitive_distance(primitives, i, x, y, z)
+        d = _distance(_numbers(primitives, i), x, y, z)
         at = k
         while at > 0 and near[at - 1] > d:
             near[at], on[at] = near[at - 1], on[at - 1]
@@ -211,11 +217,7 @@ def _meet_skin(primitives, on, near, count, rays, found, span, wide, outside):
             # No nearer than this, whatever the direction.
             if _CAREFUL * near[k] - gone > most + wide:
                 break
-            i = on[k]
-            if primitives[i, 14] >= 0:
-                _join_cone(primitives, i, xs, ys, zs, wide, union, nearest, which)
-            else:
-                _join_ellipsoid(primitives, i, xs, ys, zs, wide, union, nearest, which)
+            _join(primitives, on[k], rays, found, wide)
             most = -_ONE
             for ray in range(len(xs)):
                 most = max(most, union[ray] if zs[ray] <= last else -_ONE)
@@ -231,56 +233,14 @@ def _meet_skin(primitives, on, near, count, rays, found, span, wide, outside):
 
 
 @compiled
-def _join_cone(p, i, xs, ys, zs, wide, union, nearest, which):
-    """One more primitive in the union of _meet_skin, a cone."""
-    x0, y0, z0 = p[i, 0], p[i, 1], p[i, 2]
-    a0, a1, a2 = p[i, 3], p[i, 4], p[i, 5]
-    b0, b1, b2 = p[i, 6], p[i, 7], p[i, 8]
-    c0, c1, c2 = p[i, 9], p[i, 10], p[i, 11]
-    first, second, length, slope, rise = p[i, 12], p[i, 13], p[i, 14], p[i, 15], p[i, 16]
-    scale = _QUARTER / wide
-    number = np.float32(i)
+def _join(primitives, i, rays, found, wide):
+    """One more primitive, number i, in the union of _meet_skin."""
+    xs, ys = rays
+    zs, union, nearest, which = found
+    q, number, scale = _numbers(primitives, i), np.float32(i), _QUARTER / wide
     for ray in range(len(xs)):
         z = zs[ray]
-        x, y, z = z * xs[ray] - x0, z * ys[ray] - y0, z - z0
-        a = a0 * x + a1 * y + a2 * z
-        b = b0 * x + b1 * y + b2 * z
-        c = c0 * x + c1 * y + c2 * z
-        square = a * a + c * c
-        across = math.sqrt(square)
-        beyond = b - length
-        along = rise * b - slope * across
-        side = across * rise + b * slope - first
-        start = math.sqrt(square + b * b) - first
-        end = math.sqrt(square + beyond * beyond) - second
-        d = start if along < 0 else (end if along > rise * length else side)
-        u = union[ray]
-        gap = wide - abs(u - d)
-        gap = gap if gap > 0 else np.float32(0)
-        union[ray] = (d if d < u else u) - gap * gap * scale
-        closer = d < nearest[ray]
-        which[ray] = number if closer else which[ray]
-        nearest[ray] = d if closer else nearest[ray]
-
-
-@compiled
-def _join_ellipsoid(p, i, xs, ys, zs, wide, union, nearest, which):
-    """One more primitive in the union of _meet_skin, an ellipsoid."""
-    x0, y0, z0 = p[i, 0], p[i, 1], p[i, 2]
-    a0, a1, a2 = p[i, 3], p[i, 4], p[i, 5]
-    b0, b1, b2 = p[i, 6], p[i, 7], p[i, 8]
-    c0, c1, c2 = p[i, 9], p[i, 10], p[i, 11]
-    scale = _QUARTER / wide
-    number = np.float32(i)
-    for ray in range(len(xs)):
-        z = zs[ray]
-        x, y, z = z * xs[ray] - x0, z * ys[ray] - y0, z - z0
-        a = a0 * x + a1 * y + a2 * z
-        b = b0 * x + b1 * y + b2 * z
-        c = c0 * x + c1 * y + c2 * z
-        norm = math.sqrt(a * a + b * b + c * c)
-        gx, gy, gz = a0 * a + b0 * b + c0 * c, a1 * a + b1 * b + c1 * c, a2 * a + b2 * b + c2 * c
-        d = norm * (norm - _ONE) / (math.sqrt(gx * gx + gy * gy + gz * gz) + _TINY)
+        d = _distance(q, z * xs[ray], z * ys[ray], z)
         u = union[ray]
         gap = wide - abs(u - d)
         gap = gap if gap > 0 else np.float32(0)
