@@ -73,7 +73,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
         )
     with closing(open_recording(options.recording, options.camera, options.modulation)) as store:
-        start = Camera.load(options.camera) if options.camera else store.camera
+        start = store.camera
+        if options.camera:
+            start = Camera.load_for(options.camera, start.width, start.height, "the recording")
         result = _calibrate(store, board, square_m, start, options.keep_lens, options.frames)
     out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
@@ -101,11 +103,6 @@ def _calibrate(
         raise ToftrackError(
             "the recording has no amplitude images, in which the chequerboard is found; record "
             "them, too"
-        )
-    if (start.width, start.height) != (store.camera.width, store.camera.height):
-        raise ToftrackError(
-            f"the camera file is for {start.width}x{start.height} pixels, but the recording has "
-            f"{store.camera.width}x{store.camera.height}"
         )
     numbers = np.unique(np.linspace(0, len(store) - 1, frames).round().astype(int))
     views = _views(store, board, numbers)
