@@ -1,21 +1,15 @@
-"""The recordings that come with the package, also as other cameras would have recorded them."""
+"""The recordings that come with the package."""
 
 from __future__ import annotations
 
 from importlib import resources
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from helpers.tracking import errors_mm, make_tracker, sample
-from helpers.videos import RATIONAL, calibration, write_kinect
 
 import toftrack
-from toftrack.devices.base import BaseDevice
-from toftrack.devices.replay import Replay, Sample
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
-from toftrack.frames.camera import Camera
 from toftrack.recordings.store import SAMPLES, sample_file
 
 DATA = resources.files("toftrack") / "data"
@@ -81,51 +75,3 @@ def test_samples_truth_lies_on_the_recorded_hand() -> None:
         u, v = np.round(device.camera.project(joints)).astype(int).T
         gaps.extend(joints[:, 2] - frame.depth[v, u])
     assert 0.003 < np.median(gaps) < 0.025
-
-
-FRAMES = 30
-
-
-def error_mm(device: BaseDevice) -> float:
-    """The mean joint error over the first frames of the sample, as a device delivers them."""
-    tracker, estimates = make_tracker(), []
-    for frame in device:
-        depth = device.camera.rectify(frame.depth, frame.radial)
-        camera = device.camera.K
-        estimates.append(tracker.step(depth, camera, frame.index, frame.timestamp_s))
-    assert len(estimates) == FRAMES
-    return float(errors_mm(estimates, sample()).mean())
-
-
-def seen_through(camera: Camera, depth: np.ndarray, pinhole: Camera) -> np.ndarray:
-    """The (H, W) depth of a pinhole camera as another lens in its place sees it.
-
-    Interpolated on surfaces; at edges, where the neighbours lie apart, the nearest pixel.
-    """
-    at = pinhole.project(
-        np.dstack((camera.normalised_rays(), np.ones((camera.height, camera.width))))
-    )
-    u, v = np.moveaxis(at.astype(np.float32), -1, 0)
-    nearest = cv2.remap(depth, u, v, cv2.INTER_NEAREST, borderValue=0)
-    between = cv2.remap(depth, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    square = np.ones((3, 3), np.uint8)
-    apart = cv2.dilate(depth, square) - cv2.erode(depth, square)
-    edge = cv2.remap(apart, u, v, cv2.INTER_NEAREST, borderValue=1) > 0.02
-    return np.where(edge | (nearest == 0), nearest, between)
-
-
-def test_as_a_kinects_recording_through_a_rational_lens(tmp_path: Path, one_thread: None) -> None:
-    pinhole = Sample().camera
-    # Twice as many pixels, less those that a Kinect's narrow image has not.
-    K = pinhole.K.copy()
-    K[:2] *= 2
-    K[:2, 2] += (0.5 - 16, 0.5)
-    camera = Camera(K, 320, 288, np.array(RATIONAL))
-    words = [
-        np.rint(1000 * seen_through(camera, frame.depth, pinhole)).astype(np.uint16)
-        for frame in Sample(stop=FRAMES)
-    ]
-    about = calibration(K, 512, (96, 90))
-    path = write_kinect(tmp_path / "hand.mkv", np.stack(words), about=about)
-    straight_mm = error_mm(Sample(stop=FRAMES))
-    assert error_mm(Replay(path)) == pytest.approx(straight_mm, abs=1.0)
