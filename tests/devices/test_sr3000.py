@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import usb.core
 from helpers import programs
-from helpers.programs import QUICK, interrupted_when
+from helpers.programs import QUICK
 from helpers.settings import persistence_settings, sr3000, sr3000_emulator, usb_settings
 
 from toftrack.devices.replay import Sample
@@ -415,31 +415,14 @@ def test_bad_settings_are_reported(make: Any, words: str) -> None:
         make()
 
 
-# From the command line.
-
-EMULATED = ("device=sr3000", "device.transport=emulated", "view=none")
-
-
-def track(folder: Path, *overrides: str) -> tuple[int, str, str]:
-    return programs.call(*EMULATED, *overrides, *QUICK, "hydra.run.dir=out", folder=folder)
-
-
 def test_tracks_through_faults_and_an_unplugged_cable(tmp_path: Path) -> None:
     faults = "device.emulated.faults=[unplug_during@6,short@9,zeros@12,timeout@14]"
-    usual = ("device.keep=every", "device.stop=24", "device.usb.timeout_ms=99")
-    status, out, err = track(tmp_path, faults, *usual)
+    camera = ("device=sr3000", "device.transport=emulated", "device.keep=every", "device.stop=24")
+    usual = ("device.usb.timeout_ms=99", "view=none", "hydra.run.dir=out", *QUICK)
+    status, out, err = programs.call(*camera, *usual, faults, folder=tmp_path)
     assert status == 0, err
     with np.load(tmp_path / "out" / "track.npz") as result:
         assert len(result["joints_m"]) == 24
         assert result["lost"][12]  # the frame without a reading
         assert not result["lost"][-3:].any()
     assert "22 delivered" in out + err
-
-
-def test_ctrl_c_keeps_what_was_done(tmp_path: Path) -> None:
-    lines = tmp_path / "out" / "track.jsonl"
-    with interrupted_when(lambda: lines.exists() and lines.stat().st_size):
-        status, _, err = track(tmp_path, "device.emulated.loop=true")
-    assert status == 130
-    assert "interrupted" in err and "Traceback" not in err
-    assert (tmp_path / "out" / "track.npz").exists()
