@@ -255,8 +255,3 @@ def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], wo
             (folder / name).write_bytes(content)
     with pytest.raises(ToftrackError, match=words):
         read_image_folder(folder).image(0)
-
-
-def test_a_folder_that_is_not_there_is_reported(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="there is no folder"):
-        read_image_folder(tmp_path / "nope")

@@ -187,13 +187,11 @@ def read_image_folder(
 
     camera_file: instead of the folder's `camera.json`.  bare: what is given goes before what
     `camera.json` says; the unit is else 0.001 (of floats 1), fps 25. Raises ToftrackError: there is
-    no folder, depth image or camera, or the first image is damaged, or of another size than the
-    camera's; later, another one.
+    no depth image or camera, or the first image is damaged, or of another size than the camera's;
+    later, another one.
     """
     folder = Path(os.path.expanduser(folder))
     zipped = folder.suffix.lower() == ".zip" and not folder.is_dir()
-    if not zipped and not folder.is_dir():
-        raise ToftrackError(f"there is no folder '{folder}'; give a folder of depth images")
     files = ZippedFiles(file_of(folder)) if zipped else Files(folder)
     depth, amplitude, left_out = _sorted_out(files)
     if amplitude and len(amplitude) != len(depth):

@@ -48,16 +48,12 @@ def nominal_camera() -> Camera:
 def decode_frame(
     data: bytes, range_m: float, amplitude_threshold: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The images of a raw frame of FRAME_BYTES bytes (else ToftrackError), new arrays: (144, 176)
-    float32 metres along each pixel's ray, 0 = no reading, and the (144, 176) uint16 amplitude.
+    """The images of a raw frame of FRAME_BYTES bytes, new arrays: (144, 176) float32 metres along
+    each pixel's ray, 0 = no reading, and the (144, 176) uint16 amplitude.
 
     range_m: what the largest distance word stands for.  amplitude_threshold: pixels of a smaller
     amplitude become "no reading".
     """
-    if len(data) != FRAME_BYTES:
-        raise ToftrackError(
-            f"a frame of the SR3000 has {FRAME_BYTES} bytes, but this one has {len(data)}"
-        )
     words = np.frombuffer(data, _WORD).reshape(2, HEIGHT, WIDTH)
     radial = words[0].astype(np.float32) * np.float32(range_m / _LARGEST_WORD)
     amplitude = words[1].astype(np.uint16)
