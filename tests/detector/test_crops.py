@@ -38,8 +38,6 @@ from toftrack.detector.weights import load_weights
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 K = intrinsics(200.0, 144, 176)
 PRECOMPILED = np.array([[0.0, 0.0, 0.45]])
 

@@ -22,8 +22,6 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def detector(**changes: float) -> HandDetector:
     return HandDetector(*small_networks(), detector_settings(**changes))

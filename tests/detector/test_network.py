@@ -10,8 +10,6 @@ from toftrack.detector.crops import CROP, CROP_CHANNELS
 from toftrack.detector.network import STRIDE, PoseNet, Proposed, cube_rotations
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_the_anchors_are_the_24_rotations_of_the_cube() -> None:
     anchors = cube_rotations()

@@ -26,7 +26,6 @@ from toftrack.errors import ToftrackError
 from toftrack.training import onnx_export
 from toftrack.training.__main__ import main
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 NETWORKS = {"pose": 3, "finder": 2}
 """How many of their convolutions are the first and the last ones."""
 

@@ -19,8 +19,6 @@ from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import DEFAULT_FILE, load_weights, save_weights
 from toftrack.errors import ToftrackError
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 CROPS = 2 * torch.rand(2, CROP_CHANNELS, 64, 64, generator=torch.Generator().manual_seed(0)) - 1
 WHOLE = torch.rand(1, 2, 32, 48, generator=torch.Generator().manual_seed(0))
 ABOUT = {"seed": 3, "images": 12}

@@ -57,7 +57,7 @@ def test_what_a_program_s_process_cannot_do_is_one_sentence() -> None:
         timed([Program("wrong", ("nothing=1",))], 1)
 
 
-def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:
+def test_a_small_run_writes_json(tmp_path, capsys) -> None:
     file = tmp_path / "figures.json"
     arguments = ["--particles", "4", "8", "--seconds", "0.01", "--frames", "--json", str(file)]
     benchmark.main(["speed", *arguments])
@@ -80,7 +80,7 @@ def test_a_small_run_writes_json(tmp_path, capsys, one_thread) -> None:
     assert "default, searching" in capsys.readouterr().out
 
 
-def test_rows_are_printed_as_they_come(monkeypatch, capsys, one_thread) -> None:
+def test_rows_are_printed_as_they_come(monkeypatch, capsys) -> None:
     def interrupted(*_):
         raise KeyboardInterrupt
 

@@ -29,8 +29,6 @@ from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.closed_form import render_range_images
 from toftrack.render.segmentation import Observation
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])
 SETTINGS = refinement()
 SPREAD = torch.tensor([0.005] * 3 + [0.08] * 24)

@@ -19,8 +19,6 @@ from toftrack.refinement import shape_fit
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, keypoints_system
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 KEYPOINTS_OFF = torch.tensor(shape_fit.KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
 

@@ -25,9 +25,6 @@ from toftrack.render.scoring import Counts, Evidence, dilate_disc, disc_square, 
 from toftrack.render.torch_scorer import rendered_depths
 from toftrack.tracking.backend import choose_backend, make_scorer
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 BACK_ENDS = ("torch", "numba")
 CPU = torch.device("cpu")
 SIZES = ((48, 64), (144, 176), (240, 320))

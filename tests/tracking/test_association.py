@@ -22,8 +22,6 @@ from toftrack.tracking.association import (
 )
 from toftrack.tracking.state import Track
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def seen(x: float, side: str = "right", row: int = -1, **changes: object) -> SideDetection:
     """A hand at a place of the finder, or of the track of a row."""

@@ -33,8 +33,6 @@ from toftrack.tracking.candidates import (
 )
 from toftrack.tracking.model import TrackerModel
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def model_with(**settings: float) -> TrackerModel:
     """The tracker of a right hand with some settings of the detector."""

@@ -39,8 +39,6 @@ from toftrack.tracking.confidence import (
 from toftrack.tracking.paper import propagated_sigma
 from toftrack.tracking.state import Track
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]], np.float32)
 WALL = np.full((144, 176), 0.9, np.float32)
 JOINTS = confidence_model().joints

@@ -32,8 +32,6 @@ from toftrack.tracking.scene import Scene
 from toftrack.tracking.state import SideEvidence, Track
 from toftrack.tracking.step import step
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 HERE, THERE = hand_at(0.0), hand_at(0.3)
 IMAGE = image_of(HERE, THERE)
 SURE = SideEvidence(6.0, comparisons=9, age_s=0.0)

@@ -30,8 +30,6 @@ from toftrack.tracking.report import TrackResult
 from toftrack.tracking.state import ParticleSet, Track, TrackerState
 from toftrack.tracking.step import filter_tracks, step, update_track
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
 IMAGE = image_of(HERE, THERE)
 

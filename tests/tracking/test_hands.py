@@ -31,8 +31,6 @@ def beside_its_mirror(scene: Scene, shift_px: int, later: int = 0, farther: floa
     return Scene(merged, scene.k, np.stack((scene.joints_m, joints)))
 
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 SMALL = ("filter.particles=80",)
 ROWS = range(14, 34)
 """Frames of the sample with the hand to the left of the image's middle."""

@@ -20,8 +20,6 @@ from toftrack.tracking.model import FilterModel
 from toftrack.tracking.paper import PaperModel, RoughStart, ScoreThreshold, palm_centre
 from toftrack.tracking.state import Track
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
 PAPER = ("experiment=paper", "filter.particles=50")
 

@@ -17,8 +17,6 @@ from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import View
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 TRUTH = hand_at()
 NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0}
 

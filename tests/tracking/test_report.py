@@ -16,8 +16,6 @@ from toftrack.tracking.confidence import JOINT_FEATURES, Status
 from toftrack.tracking.report import TrackResult, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 IMAGE = replace(EMPTY, index=5, timestamp_s=0.2)
 SIDES = {"right": 5.0, "left": -5.0, "perhaps right": 0.3, "perhaps left": -0.3, "": 0.0}
 

@@ -19,8 +19,6 @@ from toftrack.render.reference import ReferenceScorer
 from toftrack.tracking.scene import Scene, _own
 from toftrack.tracking.views import expected_of
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 LEFT, RIGHT = hand_at(-0.06, 0.5), hand_at(0.06, 0.55)
 BOTH = image_of(LEFT, RIGHT)
 

@@ -25,8 +25,6 @@ from toftrack.tracking.sides import (
 )
 from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 SMALL = ("filter.particles=80",)
 ARM = np.array([-0.1, 0.0, 0.5]), np.array([0.0, 0.8, 0.6])
 """Of a hand that is held out to the camera."""

@@ -15,8 +15,6 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.tracking.tracker import Tracker
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 SMALL = ("filter.particles=80",)
 
 

@@ -15,9 +15,6 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.render.model_image import model_range_image
 from toftrack.tracking.tracker import Tracker
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
-
 FRAMES = 40
 
 

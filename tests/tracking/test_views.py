@@ -39,8 +39,6 @@ from toftrack.tracking.views import (
     update_shape,
 )
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 ELSEWHERE = SAME_PLACE_M + 0.05
 HERE, THERE = hand_at(0.0), hand_at(ELSEWHERE)
 BOTH = image_of(HERE, THERE)

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 from helpers.tracking import errors_mm, make_tracker, sample
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 
