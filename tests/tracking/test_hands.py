@@ -12,19 +12,14 @@ from toftrack.frames.estimate import Estimate
 from toftrack.tracking.tracker import HandsTracker
 
 
-def beside_its_mirror(scene: Scene, shift_px: int, later: int = 0, farther: float = 1.0) -> Scene:
-    """A right hand's recording and its mirror image, whose principal point is the same; joints_m is
-    (2, T, 21, 3), the right hand's first.
-
-    shift_px: the mirrored image is moved so far to the right, as by a shear along the depth.
-    later: frames that the mirrored hand is ahead.  farther: and as much larger and farther away.
+def beside_its_mirror(scene: Scene, shift_px: int) -> Scene:
+    """A right hand's recording and its mirror image, moved so far to the right as by a shear along
+    the depth; joints_m is (2, T, 21, 3), the right hand's first.
     """
-    other = scene.mirrored().scaled(farther)
-    depth = np.roll(other.depth_m, -later, 0)
-    joints = np.roll(other.joints_m, -later, 0).copy()
-    moved = np.zeros_like(depth)
+    other = scene.mirrored()
+    joints, moved = other.joints_m.copy(), np.zeros_like(other.depth_m)
     columns = round(scene.k[0, 2] - other.k[0, 2]) + shift_px
-    moved[:, :, max(0, columns) :] = depth[:, :, : depth.shape[2] - max(0, columns)]
+    moved[:, :, columns:] = other.depth_m[:, :, :-columns]
     joints[..., 0] += (other.k[0, 2] - scene.k[0, 2] + columns) / scene.k[0, 0] * joints[..., 2]
     nearer = (scene.depth_m > 0) & ((moved == 0) | (scene.depth_m < moved))
     merged = np.where(nearer, scene.depth_m, moved).astype(np.float32)
