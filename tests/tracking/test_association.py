@@ -35,32 +35,22 @@ def costs_of(tracks: list[Track], found: list[SideDetection], dt_s: float = FRAM
 # Assignment.
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 5), (2, 2), (3, 7), (6, 6), (9, 30), (0, 2)])
-def test_an_assignment_costs_as_little_as_scipy_s(shape: tuple[int, int]) -> None:
-    draw = np.random.default_rng(7)
-    for _ in range(50):
-        cost = draw.normal(0, 4, shape)
-        cost = cost.round() if draw.random() < 0.5 else cost  # with equal ones
-        found = least_cost(cost)
-        assert len(set(found)) == len(found) == shape[0]
-        expected = cost[linear_sum_assignment(cost)].sum()
-        assert cost[range(shape[0]), found].sum() == pytest.approx(expected)
-
-
 def test_costs_that_are_no_numbers_end_the_search_all_the_same() -> None:
     cost = np.full((2, 3), np.nan)
     assert len(set(least_cost(cost))) == 2
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (3, 2), (2, 4), (4, 3), (3, 0), (0, 2)])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 2), (2, 4), (6, 6), (9, 30), (3, 0), (0, 2)])
 def test_as_many_tracks_as_possible_have_a_detection_and_none_an_impossible_one(
     shape: tuple[int, int],
 ) -> None:
     draw = np.random.default_rng(7)
-    for impossible in (0.3, 0.7, 1.0):
+    for impossible in (0.0, 0.0, 0.3, 0.7, 1.0) * 10:
         cost = draw.normal(0, 4, shape)
+        cost = cost.round() if draw.random() < 0.5 else cost  # with equal ones
         cost[draw.random(shape) < impossible] = math.inf
         pairs = [(row, column) for row, column in enumerate(assign(cost)) if column >= 0]
+        assert len({column for _, column in pairs}) == len(pairs)
         assert all(math.isfinite(cost[pair]) for pair in pairs)
         bounded = np.where(np.isfinite(cost), cost, 1e3)
         best = bounded[linear_sum_assignment(bounded)]
