@@ -65,14 +65,6 @@ def test_a_number_and_a_time_that_are_none_are_refused(index: Any, timestamp_s: 
         tracker.step(scene.depth_m[0], scene.k, index, timestamp_s)
 
 
-def test_a_lens_that_is_covered_ends_no_run() -> None:
-    """Many cameras say 65535 millimetres where there is no reading."""
-    tracker, scene = quick(), sample()
-    covered = np.full_like(scene.depth_m[0], 65.535)
-    assert tracker.step(covered, scene.k).lost
-    assert not [tracker.step(scene.depth_m[0], scene.k) for _ in range(5)][-1].lost
-
-
 @pytest.mark.parametrize("kept", [0, 5])
 @pytest.mark.parametrize("experiment", [(), ("experiment=paper",)], ids=["default", "paper"])
 def test_a_recording_replayed_from_a_saved_state_gives_the_same_estimates(
