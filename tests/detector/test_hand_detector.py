@@ -18,7 +18,6 @@ from toftrack.detector import hand_detector as module
 from toftrack.detector.detection import Detection, doubted_sigma_m, merit
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.proposals import Places
-from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
@@ -128,20 +127,6 @@ def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
 def test_hands_that_are_known_take_no_place_from_those_that_are_not(known: int) -> None:
     search = detector(places=2, least=0.0).start_search
     assert len(search(sample().depth_m[0], sample().k, known)().centre_m) == 2 + known
-
-
-def test_settings_are_checked() -> None:
-    for name, value in {
-        "places": 0,
-        "hypotheses": 1.5,
-        "least": 2.0,
-        "merit": math.nan,
-        "every": 0,
-        "sure": 0.4,
-        "keypoint_m": 0.0,
-    }.items():
-        with pytest.raises(ToftrackError, match=f"detector.{name}="):
-            detector_settings(**{name: value})
 
 
 def test_keypoints_of_fingers_in_one_another_are_doubted() -> None:

@@ -16,7 +16,6 @@ from helpers.tracking import sample
 from reference.refinement import point_jacobian, refine
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
 from toftrack.evaluation.trust import TIPS
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
@@ -108,15 +107,6 @@ def check_agreement(
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_it_agrees_with_the_reference(side: str) -> None:
-    shape = default_hand_shape(side=side)
-    for seed in (1, 2):
-        _, seen, starts = seen_hand(shape, seed, n=5)
-        found = check_agreement(shape, starts, seen)
-        assert ((found - starts).abs().amax(1) > 0.01).all()
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
 def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
     for frame in (0, 36, 72):
         scene = sample().cut(frame)
@@ -126,7 +116,8 @@ def test_it_agrees_with_the_reference_on_a_recording(side: str) -> None:
         starts = torch.zeros(3, 27)
         starts[:, :3] = torch.from_numpy(scene.joints_m[0, 0])
         starts += SPREAD * torch.randn(3, 27, generator=generator(frame))
-        check_agreement(default_hand_shape(side=side), starts, seen)
+        found = check_agreement(default_hand_shape(side=side), starts, seen)
+        assert ((found - starts).abs().amax(1) > 0.01).all()
 
 
 @pytest.mark.parametrize("own", [False, True])
@@ -294,11 +285,3 @@ def test_unknown_keypoints_count_as_none_and_a_wrong_one_little() -> None:
     torch.testing.assert_close(with_keypoints(), plain, atol=1e-5, rtol=0)
     points[3] = 0.3
     assert (off_mm(with_keypoints(), HANDS.joints(plain)[0]) < 1).all()
-
-
-@pytest.mark.parametrize(
-    ("key", "value"), [("iterations", -1), ("point_m", -0.01), ("angle_rad", "wide")]
-)
-def test_impossible_settings_are_refused(key: str, value: object) -> None:
-    with pytest.raises(ToftrackError, match=f"^refine.{key}={value} "):
-        refinement(**{key: value})

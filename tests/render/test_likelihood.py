@@ -13,15 +13,13 @@ from helpers import settings
 from helpers.settings import nearest_surface
 from helpers.tracking import sample
 
-from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.reference import ReferenceScorer
-from toftrack.render.scoring import Counts, Scorer
+from toftrack.render.scoring import Counts
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.backend import make_scorer
 
 HEIGHT, WIDTH = 36, 48
 K = torch.tensor([[50.0, 0.0, 23.4], [0.0, 52.0, 17.8], [0.0, 0.0, 1.0]])
@@ -110,16 +108,11 @@ def counted_by_a_loop(state: torch.Tensor, seen: Observation, head: FMeasure) ->
     return [correct, false, missed, residual]
 
 
-def scorer_of(name: str) -> Scorer:
-    return ReferenceScorer(SHAPE) if name == "reference" else make_scorer(name, SHAPE, K.device)
-
-
-@pytest.mark.parametrize("name", ["reference", "torch", "numba"])
-def test_counts_agree_with_a_loop_over_pixels(name: str) -> None:
+def test_counts_agree_with_a_loop_over_pixels() -> None:
     states = hand_states(5, 1)
     head = f_measure(neighbourhood_m=0.03)
     seen = scene_of(states[0], 2)
-    counts = scorer_of(name)(states, head.evidence(seen))
+    counts = ReferenceScorer(SHAPE)(states, head.evidence(seen))
     expected = torch.tensor([counted_by_a_loop(state, seen, head) for state in states])
     assert (expected[:, :3].amax(0) > 20).all(), "all kinds of pixels occur"
     # Two pixels a hand may lie on an outline or at the edge of the tolerance in single precision.
@@ -171,11 +164,10 @@ def test_nothing_correct_is_impossible_and_not_undefined(coverage: float) -> Non
 def test_a_correct_pixel_counts_less_the_farther_off_it_is() -> None:
     frame = sample().cut(0)
     seen = nearest_surface()(frame.depth_m[0], frame.k)
-    scorer = ReferenceScorer(SHAPE)
-    states = torch.zeros(4, 27)
-    states[:, :3] = torch.from_numpy(frame.joints_m[0, 0])
+    state = torch.zeros(1, 27)
+    state[:, :3] = torch.from_numpy(frame.joints_m[0, 0])
     strict, paper = f_measure(residual_weight=1.0), f_measure(residual_weight=0.0)
-    found = scorer(states[:1], strict.evidence(seen))
+    found = ReferenceScorer(SHAPE)(state, strict.evidence(seen))
     assert float(paper.score(found)) > float(strict.score(found)) > 0
     # Of as many correct pixels, the nearer ones are better.
     by_residual = [float(strict.score(counts(100, 10, 10, r))) for r in (0, 25, 50, 100)]
@@ -195,20 +187,3 @@ def test_coverage_prefers_the_hypothesis_that_explains_more_of_the_image() -> No
     # A search may ask for another weight; the score that is reported never has it.
     torch.testing.assert_close(without.log_score(few, 0.5), with_it.log_score(few))
     torch.testing.assert_close(without.score(many), with_it.score(many))
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [
-        ("naming", "usual"),
-        ("tolerance_m", 0.0),
-        ("neighbourhood_m", -0.01),
-        ("beta", 0.0),
-        ("beta", "high"),
-        ("residual_weight", 1.5),
-        ("coverage", math.nan),
-    ],
-)
-def test_impossible_settings_are_refused(key: str, value: object) -> None:
-    with pytest.raises(ToftrackError, match=f"^likelihood.{key}="):
-        f_measure(**{key: value})

@@ -46,15 +46,6 @@ NO_JOINT_FEATURES = np.zeros((21, len(JOINT_FEATURES)))
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("confidence", 1.5), ("give_up", -0.1), ("memory", 1.0), ("patience", -1), ("patience", 2.5)],
-)
-def test_settings_that_cannot_be_are_refused(name: str, value: object) -> None:
-    with pytest.raises(ToftrackError, match=f"lost.{name}"):
-        confidence_model(**{name: value})
-
-
-@pytest.mark.parametrize(
     ("changes", "words"),
     [
         ({"scale": 0.0}, "joints.scale"),

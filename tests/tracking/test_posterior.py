@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from helpers.detection import detection_of
 from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
 from helpers.settings import posterior_weights
 
-from toftrack.errors import ToftrackError
 from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import View
 
@@ -126,10 +124,3 @@ def test_terms_and_other_hands_add_up() -> None:
 def test_without_a_detection_keypoints_say_nothing() -> None:
     blind = view_of(image_of(TRUTH), track_of(TRUTH))
     assert not added(blind, keypoints=0.4).any()
-
-
-@pytest.mark.parametrize("name", list(NONE))
-@pytest.mark.parametrize("value", [-0.1, math.nan, "much"])
-def test_a_weight_that_cannot_be_is_named(name: str, value: float) -> None:
-    with pytest.raises(ToftrackError, match=f"posterior.{name}"):
-        posterior_weights(**{name: value})
