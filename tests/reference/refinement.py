@@ -14,13 +14,10 @@ from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose, forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.refinement.gauss_newton import (
     ALONG_BONE,
-    AXIS_ROW,
     FACING_M,
     JOINT_FRAME,
     KEYPOINT_SIGMAS,
-    MOVES,
     NEAREST_M,
-    ORIGIN_ROW,
     POINT_REACH,
     SILHOUETTE_PX,
     Keypoints,
@@ -39,25 +36,49 @@ class Residuals(NamedTuple):
     values: Tensor
 
 
-def point_jacobian(pose: HandPose, shape: HandShape, x: Tensor, n: Tensor, frame: Tensor) -> Tensor:
-    """How n.X changes with the 27 degrees of freedom for points X that move with frames.
+class Moving(NamedTuple):
+    """N hands, and how their frames change with the 27 degrees of freedom: translation, small
+    rotation about the wrist in the camera frame, angles.
 
-    pose: of N hands.  x, n: (N, P, 3) points and directions in the camera frame.
-    frame: (P,) or (N, P) which of the 16 frames each point is attached to.
-    Returns (N, P, 27): translation, small rotation about the wrist in the camera frame, angles.
+    frames_by: (27, N, 16, 3, 3).  origins_by: (27, N, 16, 3).
     """
-    frames, origins = pose.frames, pose.origins_m
-    axis_row, origin_row = table((AXIS_ROW, ORIGIN_ROW), torch.int64, x.device)
-    base = (frames[:, 0] @ shape.base_frames[:, :, 2].mT).mT
-    axes = torch.cat((frames[:, 1:, :, 0], base, frames[:, 1:2, :, 2]), 1)[:, axis_row]
-    if shape.side == "left":  # a mirror turns the sense of rotation round
-        axes = -axes
-    # n.(a x (X - o)) = (n x a).(o - X) = a.((X - o) x n)
-    arm_moment = torch.linalg.cross(x, n)
-    turning = arm_moment @ axes.mT - n @ torch.linalg.cross(axes, origins[:, origin_row]).mT
-    by_angle = turning * table(MOVES, torch.bool, x.device)[frame]
-    by_rotation = torch.linalg.cross(x - origins[:, :1], n)
-    return torch.cat((n, by_rotation, by_angle), -1)
+
+    pose: HandPose
+    frames_by: Tensor
+    origins_by: Tensor
+
+
+def moving(states: Tensor, shape: HandShape) -> Moving:
+    """Of hands (N, 27), by central differences in double precision."""
+    all_states = states.double().repeat(27, 1)
+    steps = 1e-6 * torch.eye(27, dtype=torch.float64).repeat_interleave(len(states), 0)
+    ends = [
+        forward_kinematics(moved(all_states, step), shape.to(torch.float64))
+        for step in (steps, -steps)
+    ]
+    by = [
+        ((there - here) / 2e-6).unflatten(0, (27, len(states))).to(states.dtype)
+        for there, here in zip(*((end.frames, end.origins_m) for end in ends), strict=True)
+    ]
+    return Moving(forward_kinematics(states, shape), *by)
+
+
+def moved(states: Tensor, step: Tensor) -> Tensor:
+    """States after a step of translation, rotation in the camera frame and angles, (N, 27) each."""
+    turned = rotvec_composition(step[:, 3:6], states[:, 3:6])
+    return torch.cat((states[:, :3] + step[:, :3], turned, states[:, 6:] + step[:, 6:]), 1)
+
+
+def point_jacobian(hand: Moving, x: Tensor, n: Tensor, frame: Tensor) -> Tensor:
+    """(N, P, 27) how n.X changes with the degrees of freedom for points X that move with frames.
+
+    x, n: (N, P, 3) points and directions in the camera frame.
+    frame: (P,) or (N, P) which of the 16 frames each point is attached to.
+    """
+    at = torch.arange(len(x))[:, None], frame.expand(x.shape[:2])
+    local = hand.pose.frames[at].mT @ (x - hand.pose.origins_m[at])[..., None]
+    by = (hand.frames_by[:, *at] @ local)[..., 0] + hand.origins_by[:, *at]
+    return (by * n).sum(-1).movedim(0, -1)
 
 
 def points_around(seen: SeenPoints, middle_m: Tensor, count: int) -> tuple[Tensor, Tensor]:
@@ -98,16 +119,18 @@ def refine(
         informed = informed | keypoints.sigma_m.isfinite().any(1)
     refined = states
     for _ in range(settings.iterations):
-        pose = forward_kinematics(refined, shape)
+        hand = moving(refined, shape)
         parts = [
-            point_residuals(pose, points, there, shape, surface, settings),
-            silhouette_residuals(pose, seen, shape, settings),
+            point_residuals(hand, points, there, surface, settings),
+            silhouette_residuals(hand, seen, shape, settings),
         ]
         if keypoints is not None:
-            parts.append(keypoint_residuals(pose, keypoints, shape))
+            parts.append(keypoint_residuals(hand, keypoints))
         rows, values = (torch.cat(part, 1) for part in zip(*parts, strict=True))
         step = _step(rows, values, refined[:, 6:] - prior_angles, settings)
-        refined = _moved(refined, step)
+        low, high = table(ANGLE_LIMITS, step.dtype, step.device).unbind(1)
+        refined = moved(refined, step)
+        refined[:, 6:] = refined[:, 6:].clamp(low, high)
     return torch.where(informed[:, None], refined, states)
 
 
@@ -123,14 +146,6 @@ def _step(rows: Tensor, values: Tensor, off_prior: Tensor, settings: Refinement)
     damping = settings.damping * diagonal.mean(1, keepdim=True) + 1e-3 * diagonal
     # Hands that are no numbers stay so, and stop nobody else.
     return -torch.linalg.solve_ex(normal + damping.diag_embed(), gradient).result
-
-
-def _moved(states: Tensor, step: Tensor) -> Tensor:
-    """States after a step of translation, rotation in the camera frame and angles, in limits."""
-    low, high = table(ANGLE_LIMITS, states.dtype, states.device).unbind(1)
-    turned = rotvec_composition(step[:, 3:6], states[:, 3:6])
-    bent = (states[:, 6:] + step[:, 6:]).clamp(low, high)
-    return torch.cat((states[:, :3] + step[:, :3], turned, bent), 1)
 
 
 def nearest_ellipsoids(
@@ -155,14 +170,10 @@ def nearest_ellipsoids(
 
 
 def point_residuals(
-    pose: HandPose,
-    points: Tensor,
-    there: Tensor,
-    shape: HandShape,
-    surface: HandSurface,
-    settings: Refinement,
+    hand: Moving, points: Tensor, there: Tensor, surface: HandSurface, settings: Refinement
 ) -> Residuals:
     """Of the seen points (N, P, 3) that are there (N, P): their distances from the surface."""
+    pose = hand.pose
     distance, nearest, normals = nearest_ellipsoids(pose, points, surface)
     # Seen surfaces face the camera; what lies beyond the wrist is the arm.
     facing = (normals * points).sum(-1) < 0
@@ -172,16 +183,16 @@ def point_residuals(
     # Geman and McClure's robust weight, which forgets outliers.
     weight = use / (1 + (distance / (POINT_REACH * settings.reach_m)).square()) / settings.point_m
     x = points - distance[..., None] * normals
-    rows = point_jacobian(pose, shape, x, normals, surface.frame_index[nearest])
+    rows = point_jacobian(hand, x, normals, surface.frame_index[nearest])
     # The model's surface moves towards the point: the distance falls as n.X grows.
     return Residuals(-rows * weight[..., None], distance * weight)
 
 
 def silhouette_residuals(
-    pose: HandPose, seen: SeenPoints, shape: HandShape, settings: Refinement
+    hand: Moving, seen: SeenPoints, shape: HandShape, settings: Refinement
 ) -> Residuals:
     """Of points on the bones' axes: how far they stick out of the silhouette, in u and in v."""
-    frames, origins = pose.frames[:, 1:], pose.origins_m[:, 1:]
+    frames, origins = hand.pose.frames[:, 1:], hand.pose.origins_m[:, 1:]
     (top, left), (high, wide) = seen.corner, seen.beside.shape
     if high == 0:
         return Residuals(frames.new_zeros(len(frames), 0, 27), frames.new_zeros(len(frames), 0))
@@ -203,7 +214,7 @@ def silhouette_residuals(
     by_u = torch.stack((k[0, 0] / z, zero, -k[0, 0] * x[..., 0] / z.square()), -1)
     by_v = torch.stack((zero, k[1, 1] / z, -k[1, 1] * x[..., 1] / z.square()), -1)
     by = torch.cat((by_u, by_v), 1)
-    rows = point_jacobian(pose, shape, x.repeat(1, 2, 1), by, frame.repeat(2))
+    rows = point_jacobian(hand, x.repeat(1, 2, 1), by, frame.repeat(2))
     return Residuals(rows * weight[..., None], gap.mT.flatten(1) * weight)
 
 
@@ -219,17 +230,17 @@ def nearest_px(seen: SeenPoints, row: Tensor, column: Tensor) -> Tensor:
     return found.flip(1).to(seen.k.dtype).reshape(*row.shape, 2)
 
 
-def keypoint_residuals(pose: HandPose, keypoints: Keypoints, shape: HandShape) -> Residuals:
+def keypoint_residuals(hand: Moving, keypoints: Keypoints) -> Residuals:
     """Of the joints: how far they are from their keypoints, along each of the camera's axes.
 
     keypoints: of each of the N hands, see Keypoints.of_each.
     """
-    gap = pose.joints_m - keypoints.points_m
+    gap = hand.pose.joints_m - keypoints.points_m
     sigma = keypoints.sigma_m
     away = (gap.norm(dim=-1) / (KEYPOINT_SIGMAS * sigma)).square()
     weight = (1 / ((1 + away) * sigma)).repeat_interleave(3, 1)
-    x = pose.joints_m.repeat_interleave(3, 1)
+    x = hand.pose.joints_m.repeat_interleave(3, 1)
     n = torch.eye(3, dtype=x.dtype, device=x.device).repeat(21, 1).expand_as(x)
     frame = table(JOINT_FRAME, torch.int64, x.device).repeat_interleave(3)
-    rows = point_jacobian(pose, shape, x, n, frame)
+    rows = point_jacobian(hand, x, n, frame)
     return Residuals(rows * weight[..., None], gap.flatten(1) * weight)
