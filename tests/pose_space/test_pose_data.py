@@ -293,7 +293,7 @@ def test_a_single_clip_has_no_held_out_figures() -> None:
 def test_figures_of_any_data_are_drawn(dims: int) -> None:
     data = PoseData(random_angles(30), ("mine",) * 30, torch.zeros(30), ({},))
     space = fit_pose_space("pca", dims, data)
-    assert manifold_figure(space).shape[2] == 3
+    assert manifold_figure(space).std() > 0
     assert traversals_figure(space, steps=3, size=60).shape == (dims * 92, 180, 3)
     assert corners_figure(space, size=60).std() > 0
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.settings import nearest_surface, rough_start
-from helpers.tracking import Scene, configuration, errors_mm, follow, make_tracker, sample
+from helpers.tracking import Scene, configuration, errors_mm, first, follow, make_tracker, sample
 from omegaconf import OmegaConf
 
 from toftrack.compute.rigid import MOTIONS, rotated_pivot
@@ -22,10 +22,6 @@ from toftrack.tracking.state import Track
 
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]
 PAPER = ("experiment=paper", "filter.particles=50")
-
-
-def first(n: int) -> Scene:
-    return sample().cut(*range(n))
 
 
 def observed(scene: Scene) -> Observation:
@@ -84,12 +80,14 @@ def test_a_pose_that_is_not_six_numbers_is_refused(pose: tuple[float, ...]) -> N
         rough_start(pose=pose)
 
 
-@pytest.mark.parametrize("frame", range(0, 100, 20))
-def test_the_palm_is_expected_on_the_hand_or_the_wrist(frame: int) -> None:
-    scene = sample().cut(frame)
-    centre = palm_centre(observed(scene))
-    assert centre.shape == (3,) and centre.dtype == np.float32
-    assert np.linalg.norm(centre - scene.joints_m[0, PALM].mean(0)) < 0.2
+def test_the_palm_is_mostly_expected_where_it_is_and_else_on_the_wrist_or_arm() -> None:
+    scenes = [sample().cut(frame) for frame in range(0, 100, 5)]
+    centres = np.stack([palm_centre(observed(scene)) for scene in scenes])
+    assert centres.shape == (20, 3) and centres.dtype == np.float32
+    palms = np.stack([scene.joints_m[0, PALM].mean(0) for scene in scenes])
+    off_m = np.linalg.norm(centres - palms, axis=1)
+    # The middle of all the pixels is 0.038 off.
+    assert np.median(off_m) < 0.033 and off_m.max() < 0.2
 
 
 def test_a_surface_that_is_all_wall_still_has_a_place_on_it() -> None:
