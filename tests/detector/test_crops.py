@@ -33,7 +33,7 @@ from toftrack.detector.crops import (
 )
 from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
-from toftrack.detector.proposals import KEPT, Places, run_pose_network, start_finding
+from toftrack.detector.proposals import KEPT, run_pose_network, start_finding
 from toftrack.detector.weights import load_weights
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -97,8 +97,9 @@ def reference(
     """What run_pose_network says, by PoseNet.decode of the reference's crops."""
     flip = np.array([-1.0 if side == "left" else 1.0, 1.0, 1.0])
     mirror, mirror_turn = torch.from_numpy(flip).float(), torch.from_numpy(flip[[1, 0, 0]]).float()
-    if side == "left":
-        depth_m, k = mirrored(depth_m, k)
+    if side == "left":  # as a mirror shows it
+        depth_m, k = np.ascontiguousarray(depth_m[:, ::-1]), k.copy()
+        k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
     ups = [None] * len(centres_m) if up is None else list(up * flip)
     centres_m = centres_m * flip
     turns = [crop_rotation(*one) for one in zip(centres_m, ups, strict=True)]
@@ -126,19 +127,6 @@ def reference(
     found["sigma_m"] = torch.stack([doubted_sigma_m(*one) for one in each])
     found |= {"present": p.present.sigmoid(), "right_side": p.right.sigmoid()}
     return found | {"parts": p.parts.argmax(1).byte()}
-
-
-def mirrored(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """An image as a mirror shows it, and its intrinsics."""
-    k = k.copy()
-    k[0, 2] = depth_m.shape[1] - 1 - k[0, 2]
-    return np.ascontiguousarray(depth_m[:, ::-1]), k
-
-
-def find_hands(
-    finder: Finder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
-) -> Places:
-    return start_finding(finder, depth_m, k, most, least)()
 
 
 @pytest.mark.parametrize("centre", [(0.0, 0.0, 0.5), (0.3, 0.2, 0.4)])
@@ -263,7 +251,7 @@ def test_of_any_image_something_finite_is_said(name: str, side: str) -> None:
     depth, k = strange_images()[name]
     pose, finder = small_networks()
     for least in (0.0, 0.5):
-        places = find_hands(finder, depth, k, 3, least)
+        places = start_finding(finder, depth, k, 3, least)()
         assert places.centre_m.shape == (len(places.probability), 3)
         assert len(places.probability) <= 3
         assert np.isfinite(places.centre_m).all() and (places.centre_m[:, 2] > 0).all()
@@ -289,7 +277,8 @@ class SeesTwoPalms(Finder):
 
 @pytest.mark.parametrize(("apart_m", "places"), [(0.042, 2), (0.03, 1)])
 def test_palms_of_hands_that_touch_are_two_places(apart_m: float, places: int) -> None:
-    found = find_hands(SeesTwoPalms(apart_m), sample().depth_m[0], sample().k, 3, 0.1)
+    finder = SeesTwoPalms(apart_m)
+    found = start_finding(finder, sample().depth_m[0], sample().k, 3, 0.1)()
     assert len(found.probability) == places
     if places == 2:
         assert np.linalg.norm(found.centre_m[1] - found.centre_m[0]) == pytest.approx(apart_m)

@@ -130,7 +130,7 @@ def test_hands_that_are_known_take_no_place_from_those_that_are_not(known: int) 
 
 
 def test_keypoints_of_fingers_in_one_another_are_doubted() -> None:
-    points = default_hand_points()
+    points = forward_kinematics(torch.zeros(1, 27), default_hand_shape()).joints_m[0]
     apart = doubted_sigma_m(points, torch.full((21,), 0.003), 0.19)
     together = points.clone()
     together[9:13] = points[5:9]
@@ -138,8 +138,3 @@ def test_keypoints_of_fingers_in_one_another_are_doubted() -> None:
     assert float(apart.max()) < 0.01
     for first in (5, 9):
         assert bool((found[first + 1 : first + 4] > 0.05).all()) and float(found[first]) < 0.01
-
-
-def default_hand_points() -> torch.Tensor:
-    """(21, 3) of an open hand."""
-    return forward_kinematics(torch.zeros(1, 27), default_hand_shape()).joints_m[0]

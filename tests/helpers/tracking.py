@@ -82,6 +82,11 @@ def sample() -> Scene:
     return Scene(depth, np.array(camera.K), device.truth.joints_m.astype(np.float64))
 
 
+def first(count: int) -> Scene:
+    """The first frames of it."""
+    return sample().cut(*range(count))
+
+
 class Camera(BaseDevice):
     """One that gives so many frames of the sample, of every so many one, and fails thereafter."""
 

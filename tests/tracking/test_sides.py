@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import any_hand_model, hand_at, image_of, track_of, view_of
-from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
+from helpers.tracking import errors_mm, first, follow, make_tracker
 
 from toftrack.compute.pace import FRAME_S
 from toftrack.detector.detection import NO_DETECTION
@@ -28,10 +28,6 @@ from toftrack.tracking.state import OTHER_SIDE, SideEvidence, Track
 SMALL = ("filter.particles=80",)
 ARM = np.array([-0.1, 0.0, 0.5]), np.array([0.0, 0.8, 0.6])
 """Of a hand that is held out to the camera."""
-
-
-def first(count: int = 12) -> Scene:
-    return sample().cut(*range(count))
 
 
 def known(fits: float = 0.0, side: str = "right", **changes: object) -> Track:
@@ -188,7 +184,7 @@ def test_a_track_changes_its_side_when_the_other_one_is_surely_likelier(
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_side_of_a_hand_and_of_its_mirror_image_is_found_out(side: str) -> None:
-    scene = first() if side == "right" else first().mirrored()
+    scene = first(12) if side == "right" else first(12).mirrored()
     estimates = follow(scene, *SMALL)
     assert estimates[-1].side == side
     assert 0.6 < estimates[-1].side_probability < 1.0
@@ -196,7 +192,7 @@ def test_the_side_of_a_hand_and_of_its_mirror_image_is_found_out(side: str) -> N
 
 
 def test_a_wrong_side_is_changed_once_and_the_fingers_with_it() -> None:
-    scene, tracker = first(), make_tracker(*SMALL)
+    scene, tracker = first(12), make_tracker(*SMALL)
     estimates = []
     for i, depth in enumerate(scene.depth_m):
         estimates.append(tracker.step(depth, scene.k, i, i / 25))
@@ -211,7 +207,7 @@ def test_a_wrong_side_is_changed_once_and_the_fingers_with_it() -> None:
 
 
 def test_a_hand_of_the_other_side_than_was_said_is_never_reported_as_that_hand() -> None:
-    assert all(estimate.lost for estimate in follow(first(), "hand.side=left", *SMALL))
+    assert all(estimate.lost for estimate in follow(first(12), "hand.side=left", *SMALL))
     given = follow(first(3), "hand.side=right", *SMALL)
     assert {(one.side, one.side_probability) for one in given} == {("right", 1.0)}
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
-from helpers.tracking import Scene, errors_mm, follow, make_tracker, sample
+from helpers.tracking import Scene, errors_mm, first, follow, make_tracker
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
@@ -16,10 +16,6 @@ from toftrack.render.model_image import model_range_image
 from toftrack.tracking.tracker import Tracker
 
 FRAMES = 40
-
-
-def first(n: int) -> Scene:
-    return sample().cut(*range(n))
 
 
 class Run:
