@@ -1,7 +1,5 @@
 """What the networks see: the same of a scene at any resolution, and something of any image."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

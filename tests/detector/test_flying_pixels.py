@@ -1,7 +1,5 @@
 """Flying pixels are left out, and surfaces and thin fingers are not."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """What the tracker is told by the networks: glances, their states, and searches."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The networks' answers are hands, whatever they are shown."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from helpers.detection import small_networks

@@ -1,7 +1,5 @@
 """ONNX Runtime says what torch says; its files are those of the weights, or are not used."""
 
-from __future__ import annotations
-
 import logging
 import shutil
 import threading

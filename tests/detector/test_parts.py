@@ -1,7 +1,5 @@
 """What the pose network says of pixels is said of the right ones."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

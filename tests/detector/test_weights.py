@@ -1,7 +1,5 @@
 """The file of weights: written, read again, and refused with a sentence where it is broken."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`toftrack benchmark accuracy` and `ablation`: what they measure, write and refuse."""
 
-from __future__ import annotations
-
 import json
 
 import cv2

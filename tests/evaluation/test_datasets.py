@@ -1,7 +1,5 @@
 """Public data sets: written in their formats, read back, and broken."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """Images that were labelled by eye: cases done by hand."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

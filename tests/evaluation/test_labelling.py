@@ -1,7 +1,5 @@
 """Labels in the making: which frames, and a file that is whole after every click."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

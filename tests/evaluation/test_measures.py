@@ -1,7 +1,5 @@
 """What is measured beside usable and silently wrong frames: cases done by hand."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """The other method beside the tracker, with a pretended MediaPipe where there is no real one."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The table of a public data set: cases done by hand."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Totals and groups over recordings and seeds, and differences of two measurements."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np

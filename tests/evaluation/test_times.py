@@ -1,7 +1,5 @@
 """Programs that are timed in turn, and `toftrack benchmark speed`."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

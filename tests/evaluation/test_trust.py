@@ -1,7 +1,5 @@
 """What a user gets of a track: cases done by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

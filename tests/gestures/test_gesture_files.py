@@ -1,7 +1,5 @@
 """A user's gestures: files, how they go with the others, and learning one from frames."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Gestures: labels that follow from the pose and do not flicker."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

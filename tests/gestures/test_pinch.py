@@ -1,7 +1,5 @@
 """Pinch: how nearly thumb and index finger touch, and one event a pinch."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

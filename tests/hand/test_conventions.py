@@ -1,7 +1,5 @@
 """Estimates say the same hand in every convention: OpenXR's, and MediaPipe's landmarks."""
 
-from __future__ import annotations
-
 import copy
 from dataclasses import fields, replace
 

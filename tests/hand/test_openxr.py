@@ -1,7 +1,5 @@
 """The joints of XR_EXT_hand_tracking, against the text of its specification."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Fingers in one another are noticed, and fingers that lie as fingers do are not."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

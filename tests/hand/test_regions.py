@@ -1,7 +1,5 @@
 """Regions of joints: axes that follow from the joints, and what lies inside."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

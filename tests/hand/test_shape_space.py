@@ -1,7 +1,5 @@
 """The components of the hand's shape: each does what its name says, and nothing else."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

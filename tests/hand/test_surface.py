@@ -1,7 +1,5 @@
 """Where the flesh lies about the bones."""
 
-from __future__ import annotations
-
 import math
 
 import torch

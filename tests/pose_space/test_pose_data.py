@@ -1,7 +1,5 @@
 """Poses to learn from: users' files, mixtures, held-out clips, the command."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

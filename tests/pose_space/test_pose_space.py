@@ -1,7 +1,5 @@
 """Pose spaces of every kind, the training poses, and model files."""
 
-from __future__ import annotations
-
 import json
 import math
 from functools import cache

@@ -1,7 +1,5 @@
 """Refinement: its derivatives, its agreement with the reference, and what it does to poses."""
 
-from __future__ import annotations
-
 import math
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The points and the silhouette that the refinement sees of a frame."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numba

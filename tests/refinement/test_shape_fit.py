@@ -1,7 +1,5 @@
 """The fit of the hand's shape: it finds hands, says how surely, and thinks again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import partial

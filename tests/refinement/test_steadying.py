@@ -1,7 +1,5 @@
 """Rest is still, movement does not lag."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

@@ -1,7 +1,5 @@
 """The F-measure of correct, false and missed pixels, against its definition pixel by pixel."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Every back end against the reference, and the reference against other ways to the same figure."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Segmentation: the nearest surface, what lies behind it, and what hides it."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """What the guards say, and what they cannot see."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

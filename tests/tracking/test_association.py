@@ -1,7 +1,5 @@
 """Which detection is of which track, and which ones are left over."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """One back end, chosen once."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

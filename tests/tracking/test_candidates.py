@@ -1,7 +1,5 @@
 """A frame's hypotheses: what is proposed for each hand, refined, scored, and selected."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """How surely an estimate and its joints are right, and what follows for the estimate's track."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

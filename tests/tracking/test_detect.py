@@ -1,7 +1,5 @@
 """When and where the networks are asked, and as which hands."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What becomes of tracks after a frame: moved, judged, ended, and each hand followed once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Two hands at once: each in its slot, neither taken for the other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.tracking import Scene, configuration, sample

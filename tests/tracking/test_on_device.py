@@ -1,7 +1,5 @@
 """On a CUDA device frames are tracked as on the CPU, and the filter's passes do not wait for it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any

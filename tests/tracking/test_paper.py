@@ -1,7 +1,5 @@
 """The paper's tracker: its rough start, its step, its parts, and every pose space with it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

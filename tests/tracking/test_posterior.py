@@ -1,7 +1,5 @@
 """The terms of the posterior, each against plain arithmetic, and what they add up to."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which hand is reported in which slot, and what is said of it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Where the tracks' hands are in a frame, and to whom its pixels belong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import cv2

@@ -1,7 +1,5 @@
 """What a part of the tracker cannot work with is refused, by the name of its key."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

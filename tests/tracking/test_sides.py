@@ -1,7 +1,5 @@
 """Which hand it is: what comparisons say, what is known besides, and when a track changes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The step as a function of a state: replayed, interleaved, forgotten, and at other frame rates."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, is_dataclass, replace
 from typing import Any

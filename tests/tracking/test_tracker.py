@@ -1,7 +1,5 @@
 """The tracker on the packaged recording, which a renderer made that is not ours."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks as they go into a frame: continued, begun, begun anew, changed to the other side."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Recordings that show no hand, or nothing, or another size every frame; by the defaults."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from helpers.tracking import errors_mm, make_tracker, sample
