@@ -58,20 +58,6 @@ class Scene:
         depth = np.ascontiguousarray(self.depth_m[:, :, ::-1])
         return Scene(depth, k, self.joints_m * [-1, 1, 1])
 
-    def turned(self, quarters: int) -> Scene:
-        """The camera rolled about its optical axis, so that the picture turns anticlockwise."""
-        scene = self
-        for _ in range(quarters % 4):
-            width, k = scene.depth_m.shape[2], scene.k.copy()
-            k[0, 0], k[1, 1] = scene.k[1, 1], scene.k[0, 0]
-            k[0, 2], k[1, 2] = scene.k[1, 2], width - 1 - scene.k[0, 2]
-            depth = np.ascontiguousarray(np.rot90(scene.depth_m, axes=(1, 2)))
-            joints = np.stack(
-                (scene.joints_m[..., 1], -scene.joints_m[..., 0], scene.joints_m[..., 2]), -1
-            )
-            scene = Scene(depth, k, joints)
-        return scene
-
 
 @cache
 def sample() -> Scene:
