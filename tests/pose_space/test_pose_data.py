@@ -70,19 +70,6 @@ def test_a_csv_of_angles_is_read_in_its_units_and_any_order(
     assert data.labels == ("mine",) * 6
 
 
-def test_labels_and_clips_beside_the_angles_are_read_and_other_columns_left_alone(
-    tmp_path: Path,
-) -> None:
-    rows = random_angles(3).rad2deg().tolist()
-    lines = ["# units: degrees", ",".join(("label", "clip", "note", *ANGLE_NAMES))]
-    for label, clip, row in zip("xyx", "112", rows, strict=True):
-        lines.append(",".join((label, clip, "hello", *map(str, row))))
-    (tmp_path / "mine.csv").write_text("\n".join(lines))
-    data = file_data(str(tmp_path / "mine.csv"))
-    assert data.labels == ("x", "y", "x")
-    assert data.clips.tolist() == [0, 0, 1]
-
-
 def test_an_npz_of_angles_is_read(tmp_path: Path) -> None:
     radians = random_angles(4)
     np.savez(
@@ -138,10 +125,14 @@ def test_a_run_that_cannot_be_learned_from_is_reported(tmp_path, changes, words)
         file_data(str(folder / "track.npz"))
 
 
-def test_the_example_of_the_documentation_is_read(tmp_path: Path) -> None:
+def test_the_documentation_s_labels_and_clips_are_read_and_another_column_left_alone(
+    tmp_path: Path,
+) -> None:
     text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     example = text.split("```\n# units")[1].split("```")[0]
-    (tmp_path / "mine.csv").write_text("# units" + example)
+    units, header, *rows = ("# units" + example).splitlines()
+    lines = [units, f"{header},note", *(f"{row},hello" for row in rows)]
+    (tmp_path / "mine.csv").write_text("\n".join(lines))
     data = file_data(str(tmp_path / "mine.csv"))
     assert data.labels == ("open", "half", "fist") and data.clips.tolist() == [0, 0, 1]
 
