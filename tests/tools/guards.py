@@ -12,7 +12,6 @@ and compares their means over seeds with BOUNDS: docs/lab/guards.md says where t
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -196,7 +195,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Is the tracker as accurate as it was?")
     parser.add_argument("--seeds", type=_seeds, default=SEEDS, help="0-19: these (0-2)")
     parser.add_argument("--break", dest="fault", choices=BREAKS, help="put a fault in")
-    parser.add_argument("--json", type=Path, help="write all figures here, too")
     options = parser.parse_args(arguments)
     seeds, processes = options.seeds, min(os.cpu_count() or 1, 8)
     # Each process tracks with one thread, as one process would: the figures are the same.
@@ -208,9 +206,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sample = list(sampled)
     for row in (*sample, *figures):
         print("  ".join(f"{name} {value:.2f}" for name, value in row.items()))
-    if options.json:
-        text = json.dumps({"sample": sample, "guards": figures}, indent=1)
-        options.json.write_text(text + "\n", encoding="utf-8")
     said = complaints(figures, sample)
     print("\n".join(said) or "all within their bounds", file=sys.stderr if said else sys.stdout)
     return 1 if said else 0
