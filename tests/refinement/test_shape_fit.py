@@ -4,10 +4,12 @@ import math
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import pytest
 import torch
 from helpers.detection import detection_of
 from helpers.tracking import make_tracker, sample
+from reference.refinement import moved
 
 from toftrack.detector.detection import Detection
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
@@ -81,6 +83,18 @@ def test_keypoints_say_by_how_much_a_hand_is_another(side: str) -> None:
     precision = information + torch.diag(torch.tensor([1e-3, 1e-3, 1e3, 1e3, 1e-3, 1e-3]))
     found = torch.linalg.solve(precision, vector)
     torch.testing.assert_close(found[seen], 0.2 * BETWEEN_FINGERS[seen], atol=0.006, rtol=0.1)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_joints_move_as_by_differences(side: str) -> None:
+    shape, state = default_hand_shape(side=side), poses(1)
+    steps, states = 1e-6 * torch.eye(27, dtype=torch.float64), state.double().repeat(27, 1)
+    there, here = (
+        forward_kinematics(moved(states, step), shape.to(torch.float64)).joints_m
+        for step in (steps, -steps)
+    )
+    found = shape_fit._joint_jacobian(forward_kinematics(state, shape), shape)
+    np.testing.assert_allclose(found, ((there - here) / 2e-6).flatten(1).T, atol=1e-5)
 
 
 def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> None:

@@ -36,7 +36,7 @@ AXIS_ROW = tuple(
     3 * finger + bone if not abduction else 15 + finger if bone == 0 else 20
     for finger, bone, abduction in _JOINTS
 )
-"""Rows of the table of axes that `point_jacobian` builds: the x axes of the 15 bones (flexion), the
+"""Rows of the table of axes that shape_fit builds: the x axes of the 15 bones (flexion), the
 z axes of the 5 base frames (abduction of the first joint), the z axis of the thumb's first bone."""
 ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
 """The frames in whose origins these axes lie."""

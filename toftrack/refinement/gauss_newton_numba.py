@@ -127,7 +127,7 @@ def nearest_ellipsoids(xyz, count, posed, distance, nearest):
 
 @compiled
 def joint_axes(frames, base_frames, mirror, axes):
-    """The axes of the 21 angles, (21, 3), see point_jacobian of the reference."""
+    """The axes of the 21 angles, (21, 3): each turns what is attached beyond it."""
     angle = 0
     for finger in range(5):
         for bone in range(3):

@@ -285,8 +285,8 @@ def keypoints_system(
 
 
 def _joint_jacobian(pose: HandPose, shape: HandShape) -> np.ndarray:
-    """(63, 27) how the joints' coordinates change with translation, rotation and angles; as
-    point_jacobian of tests/reference/refinement.py, of all joints of one hand.
+    """(63, 27) how the joints' coordinates change with translation, rotation about the
+    wrist and angles, of one hand.
     """
     frames, origins = pose.frames[0].numpy(), pose.origins_m[0].numpy()
     joints = pose.joints_m[0].numpy().astype(np.float64)
