@@ -93,7 +93,10 @@ def test_unit_quaternions_of_one_sign_have_backward_along_the_bone(state, side) 
     hand = placed(state, side)
     assert np.allclose(np.linalg.norm(hand.orientation, axis=1), 1)
     assert (hand.orientation[:, 3] >= 0).all()
-    _, _, backward = np.moveaxis(axes(hand), 1, 0)
+    x, _, backward = np.moveaxis(axes(hand), 1, 0)
+    for finger in FINGERS:  # all of it bends about one axis, which turns with its abduction
+        one, other = AT[f"{finger}_proximal"], AT[f"{finger}_distal"]
+        assert x[one] @ backward[other] == pytest.approx(0, abs=1e-6)
     for finger, bones in {"thumb": BONES[:2] + BONES[3:], **dict.fromkeys(FINGERS, BONES)}.items():
         for bone, end in zip(bones, bones[1:], strict=False):
             here, there = AT[f"{finger}_{bone}"], AT[f"{finger}_{end}"]
