@@ -135,26 +135,29 @@ def test_a_hand_of_another_size_is_proposed_with_the_same_palm() -> None:
     assert float((palms[0] - palms[1]).norm()) < 0.01
 
 
-def seen_with(parts: np.ndarray) -> tuple[Observation, Observation, np.ndarray]:
-    """A hand's image as it is, and without what is said to be a thing; (P, 3) its hand's pixels.
+HALF_A_THING = np.full((PARTS, PARTS), HAND_PART, np.uint8)
+HALF_A_THING[: PARTS // 2] = THING_PART
+DETECTION = detection_of(hand_at())
+CENTRE = DETECTION.keypoints.points_m[9].double().numpy()
+"""Of a crop about the hand's middle finger."""
 
-    parts: (PARTS, PARTS) of a crop about the hand's middle finger.
-    """
-    truth = hand_at()
-    detection = detection_of(truth)
-    centre = detection.keypoints.points_m[9].double().numpy()
-    detection = replace(detection, parts=Parts(parts, crop_rotation(centre), centre, False))
-    observation = view_of(image_of(truth), track_of(truth), detection).observation
-    return observation, without_things(observation, detection.parts), centre
+
+def parts_of(kind: np.ndarray) -> Parts:
+    """(PARTS, PARTS) of that crop."""
+    return Parts(kind, crop_rotation(CENTRE), CENTRE, False)
+
+
+def seen_with(parts: np.ndarray) -> tuple[Observation, Observation]:
+    """A hand's image as it is, and without what is said to be a thing."""
+    observation = view_of(image_of(hand_at()), track_of(hand_at()), DETECTION).observation
+    return observation, without_things(observation, parts_of(parts))
 
 
 def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:
-    parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
-    parts[: PARTS // 2] = THING_PART
-    whole, rest, centre = seen_with(parts)
+    whole, rest = seen_with(HALF_A_THING)
     assert rest.thing is not None
     assert torch.equal(rest.hand | rest.thing, whole.hand) and not (rest.hand & rest.thing).any()
-    middle = float(whole.k[1, 1]) * centre[1] / centre[2] + float(whole.k[1, 2])
+    middle = float(whole.k[1, 1]) * CENTRE[1] / CENTRE[2] + float(whole.k[1, 2])
     rows = rest.thing.nonzero()[:, 0], rest.hand.nonzero()[:, 0]
     assert rows[0].max() < middle + 2 and rows[1].min() > middle - 2
     # A finger that is behind it, or not, is neither false nor missed.
@@ -167,11 +170,8 @@ def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:
 
 
 def test_what_was_a_thing_at_the_last_look_is_left_out_until_the_next() -> None:
-    parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
-    parts[: PARTS // 2] = THING_PART
-    whole, rest, centre = seen_with(parts)
-    looked = Parts(parts, crop_rotation(centre), centre, False)
-    view = view_of(image_of(hand_at()), replace(track_of(hand_at()), parts=looked))
+    _, rest = seen_with(HALF_A_THING)
+    view = view_of(image_of(hand_at()), track_of(hand_at(), parts=parts_of(HALF_A_THING)))
     seen = as_last_seen(view).observation
     assert rest.thing is not None and seen.thing is not None
     assert torch.equal(seen.hand, rest.hand) and torch.equal(seen.thing, rest.thing)
@@ -181,7 +181,7 @@ def test_what_was_a_thing_at_the_last_look_is_left_out_until_the_next() -> None:
 
 def test_without_a_thing_all_stays_as_it_is() -> None:
     parts = np.full((PARTS, PARTS), HAND_PART, np.uint8)
-    whole, rest, _ = seen_with(parts)
+    whole, rest = seen_with(parts)
     assert rest is whole
     parts[0, :3] = THING_PART
     assert seen_with(parts)[1].thing is None, "too little for a thing"
@@ -191,16 +191,12 @@ def behind(gap_m: float, kind: int = BACKGROUND_PART) -> tuple[Observation, Dete
     """A hand whose lower half is behind a surface, which the network says is `kind`; and what it
     says of the hand.
     """
-    truth = hand_at()
-    detection = detection_of(truth)
-    centre = detection.keypoints.points_m[9].double().numpy()
-    seen = view_of(image_of(truth), track_of(truth), detection).observation
+    seen = view_of(image_of(hand_at()), track_of(hand_at()), DETECTION).observation
     before = torch.zeros_like(seen.hand)
     before[int(seen.hand.nonzero()[:, 0].float().mean()) :] = True
-    parts = Parts(np.full((PARTS, PARTS), kind, np.uint8), crop_rotation(centre), centre, False)
-    depth = torch.where(before, float(centre[2]) - gap_m, seen.depth_m)
+    depth = torch.where(before, float(CENTRE[2]) - gap_m, seen.depth_m)
     hidden = replace(seen, depth_m=depth, occluder=before, hand=seen.hand & ~before)
-    return hidden, replace(detection, parts=parts)
+    return hidden, replace(DETECTION, parts=parts_of(np.full((PARTS, PARTS), kind, np.uint8)))
 
 
 @pytest.mark.parametrize("kind", [FOREARM_PART, BACKGROUND_PART, HAND_PART, THING_PART])
