@@ -201,6 +201,11 @@ def test_of_more_than_two_hands_the_finder_sees_what_no_track_explains(
     np.testing.assert_array_equal(detector.images[0][~mine], IMAGE.depth_m[~mine])
 
 
+def test_what_is_a_reliable_track_s_is_looked_at_as_a_hand_of_neither_side() -> None:
+    _, seen, _ = looked(known(), found=FOUND, places=places_of(*FOUND), hands=4)
+    assert set(elsewhere(seen)) == {("right", 0.3), ("left", 0.3)}
+
+
 def test_where_frames_are_rare_hands_are_looked_for_where_the_tracks_are_as_well() -> None:
     _, seen, _ = looked(known(), found=FOUND, dt_s=0.2)
     assert {("right", 0.0), ("right", 0.3)} < set(elsewhere(seen))
