@@ -30,9 +30,6 @@ def costs_of(tracks: list[Track], found: list[SideDetection], dt_s: float = FRAM
     return costs(scene_of(*tracks, image=EMPTY).hands, found, dt_s)
 
 
-# Assignment.
-
-
 def test_costs_that_are_no_numbers_end_the_search_all_the_same() -> None:
     cost = np.full((2, 3), np.nan)
     assert len(set(least_cost(cost))) == 2
@@ -85,9 +82,6 @@ def test_what_is_seen_at_a_track_s_place_is_no_other_track_s() -> None:
 def test_of_two_detections_at_one_place_the_one_for_which_more_speaks_is_taken() -> None:
     found = [seen(0.0, present=0.2), seen(0.0, present=0.9)]
     assert assign(costs_of([track_of(hand_at())], found)) == [1]
-
-
-# What is left over.
 
 
 def test_what_is_no_track_s_is_left_over_each_hand_once() -> None:

@@ -217,9 +217,6 @@ def test_a_hand_that_is_mostly_covered_is_held_where_it_was() -> None:
     assert len(proposed(view).pose) == 3
 
 
-# Which one becomes the pose.
-
-
 def chosen(*rows: tuple[float, float, bool, float], hidden: bool = False) -> tuple[int, bool]:
     """The row, and whether the hand moves, of hypotheses with a place and a finger, both in metres;
     whether it is the detector's; and its log posterior.

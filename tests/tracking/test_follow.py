@@ -154,9 +154,6 @@ def test_particles_are_filtered_before_a_detection_is_waited_for(
     assert order.index("waited") == model.filter.passes
 
 
-# Which tracks go on.
-
-
 def going_on(*tracks: Track) -> TrackerState:
     numbered = [replace(track, number=at) for at, track in enumerate(tracks)]
     return keep_tracks(state_of(), numbered, right_hand_model())

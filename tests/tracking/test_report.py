@@ -64,9 +64,6 @@ def numbers(state: TrackerState, *tracks: Track) -> list[int]:
     return [slot.track for slot in reported(state, *tracks)[0].slots]
 
 
-# Which one.
-
-
 @pytest.mark.parametrize(
     ("told", "sides", "expected"),
     [
@@ -171,9 +168,6 @@ def test_what_is_taken_for_a_hand_meanwhile_does_not_change_which_one_may_come_b
         state, _ = reported(state, hand(1, side, confirmed=False, lost=True))
     assert [slot.track for slot in state.slots] == [1]
     assert numbers(state, hand(2, "left")) == [2]
-
-
-# What is said of it.
 
 
 def test_a_hand_of_the_other_side_than_was_said_is_flagged() -> None:

@@ -35,9 +35,6 @@ def known(fits: float = 0.0, side: str = "right", **changes: object) -> Track:
     return track_of(hand_at(), side=side, evidence=SideEvidence(fits, **evidence), **changes)
 
 
-# What is known besides.
-
-
 def odds_of(track: Track, others: Sequence[Track], told: str | None) -> float:
     """Beside other tracks, which get numbers of their own."""
     return side_log_odds(
@@ -71,9 +68,6 @@ def test_the_place_of_the_body_counts_beside_what_the_user_said() -> None:
     for told in (None, "right", "left"):
         here, without = (odds_of(known(body=body), [], told) for body in (0.5, 0.0))
         assert here == pytest.approx(without + 0.5)
-
-
-# When they are compared, and what it says.
 
 
 @pytest.mark.parametrize(
@@ -175,9 +169,6 @@ def test_a_track_changes_its_side_when_the_other_one_is_surely_likelier(
 ) -> None:
     assert changes_side(known(), log_odds, told) == changes
     assert changes_side(known(side="left"), -log_odds, told) == changes
-
-
-# In recordings.
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

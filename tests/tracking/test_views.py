@@ -56,9 +56,6 @@ def off_m(view: View, pose: torch.Tensor) -> float:
     return float((joints(view.track.pose) - joints(pose)).norm(dim=-1).mean())
 
 
-# Continued.
-
-
 def gone_on(
     found: SideDetection | None,
     image: DepthImage = BOTH,
@@ -104,9 +101,6 @@ def test_the_time_since_a_comparison_goes_on() -> None:
     assert view is not None and view.track.evidence.age_s == pytest.approx(0.34)
 
 
-# Of which side.
-
-
 def of_both(side: str = "right") -> SideDetection:
     """What is seen at the track's place, as a hand of either side."""
     other = detection_of(HERE, side="left" if side == "right" else "right")
@@ -136,9 +130,6 @@ def test_a_track_changes_to_the_side_that_is_likelier(
     changed = side != "right"
     assert track.age.begun != changed and track.number == 3
     assert changed or not changes_side(track, side_log_odds(track, [], told), told)
-
-
-# Begun.
 
 
 def began(new: Sequence[SideDetection], *tracks: Track, image: DepthImage = BOTH) -> list[View]:
@@ -194,8 +185,6 @@ def test_a_new_track_keeps_off_a_reliable_hand_s_pixels_and_joints() -> None:
     mine = view.observation.hand.numpy()
     assert mine.any() and not (mine & (image_of(HERE).depth_m < 1.0)).any()
 
-
-# The shape.
 
 SHORT = math.log(0.8)
 
