@@ -11,7 +11,6 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.render.model_image import model_range_image
-from toftrack.tracking.tracker import Tracker
 
 FRAMES = 40
 
@@ -156,7 +155,6 @@ def test_a_setting_that_makes_no_sense_is_one_clear_error(override: str, words: 
 def test_a_filter_of_another_size_tracks_too() -> None:
     scene = first(8)
     tracker = make_tracker("filter.particles=60", "filter.passes=2", "pose_space.dims=6")
-    assert isinstance(tracker, Tracker)
     found = [tracker.step(depth, scene.k, i, i / 25) for i, depth in enumerate(scene.depth_m)]
     assert tracker.track.cloud.particles.shape == (60, 12)
     assert float(tracker.track.cloud.weights.sum()) == pytest.approx(1)
