@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 
 from toftrack.compute.pace import FRAME_S, Duration, elapsed_s
@@ -50,13 +48,10 @@ def test_of_a_pause_no_more_counts_than_is_said() -> None:
         (None, 7.0, FRAME_S),
         (1.0, 1.02, 0.02),
         (1.0, 0.0, FRAME_S),
-        (1.0, math.nan, FRAME_S),
-        (1.0, math.inf, FRAME_S),
-        (math.nan, 1.0, FRAME_S),
         (1.0, 1.0, 1 / 120),
         (1.0, 100.0, 0.5),
     ],
-    ids=["first", "usual", "back", "not a number", "infinite", "after none", "coarse", "pause"],
+    ids=["first", "usual", "back", "coarse", "pause"],
 )
 def test_the_time_from_frame_to_frame_is_one_to_reckon_with(
     before_s: float | None, now_s: float, expected_s: float

@@ -61,6 +61,17 @@ def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> Non
     assert set(sent(receiver, gone)) == {"/toftrack/frame", "/toftrack/right/tracked"}
 
 
+def test_hands_of_several_persons_have_the_numbers_of_their_slots(receiver: socket.socket) -> None:
+    host, port = receiver.getsockname()
+    hands = hand_estimate(0), hand_estimate(0, "left"), hand_estimate(0)
+    with osc_stream(host=host, port=port) as stream:
+        stream.send(hands)
+        addresses = [message.address for message in OscBundle(receiver.recv(65535))]
+    assert len(set(addresses)) == len(addresses)
+    tracked = [address for address in addresses if address.endswith("/tracked")]
+    assert tracked == [f"/toftrack/{hand}/tracked" for hand in ("right_1", "left_2", "right_3")]
+
+
 def test_a_hand_of_which_nothing_is_said_any_more_is_told_lost_once(
     receiver: socket.socket,
 ) -> None:

@@ -53,13 +53,15 @@ def same(one: Estimate, two: Estimate) -> bool:
         (0, [0.1]),
         (math.nan, 0.0),
         (0, 10**400),
+        (0, math.nan),
+        (0, -math.inf),
         (-1, 0.0),
         (2.5, 0),
     ],
 )
 def test_a_number_and_a_time_that_are_none_are_refused(index: Any, timestamp_s: Any) -> None:
     tracker, scene = quick(), sample()
-    with pytest.raises(ToftrackError, match="a whole number from 0 on and seconds"):
+    with pytest.raises(ToftrackError, match="a whole number from 0 on and finite seconds"):
         tracker.step(scene.depth_m[0], scene.k, index, timestamp_s)
 
 
@@ -154,7 +156,7 @@ def test_a_movement_at_another_rate_has_the_same_speed() -> None:
     assert float((speeds[0] - speeds[1]).norm()) < 0.05, speeds
 
 
-@pytest.mark.parametrize("jump_s", [-100.0, 1e6, math.nan])
+@pytest.mark.parametrize("jump_s", [-100.0, 1e6])
 def test_a_clock_that_jumps_does_not_lose_the_hand(jump_s: float) -> None:
     tracker, scene = quick(), sample()
     tracked(tracker, scene, range(8))

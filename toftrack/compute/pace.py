@@ -18,12 +18,11 @@ def elapsed_s(before_s: float | None, now_s: float) -> float:
     """Seconds from one frame to the next, for all that moves and fades in the meantime.
 
     before_s: None before the first frame. Where the clock went back, as where a recording begins
-    anew, or is no number, a frame counts as FRAME_S.
+    anew, a frame counts as FRAME_S.
     """
-    if before_s is None or not now_s >= before_s:
+    if before_s is None or now_s < before_s:
         return FRAME_S
-    passed = now_s - before_s
-    return min(max(passed, _SHORTEST_S), _LONGEST_S) if math.isfinite(passed) else FRAME_S
+    return min(max(now_s - before_s, _SHORTEST_S), _LONGEST_S)
 
 
 @dataclass(frozen=True)

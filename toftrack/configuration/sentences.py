@@ -214,6 +214,12 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         if "device.bag" in keys:
             return f"{text} of this device; its recordings are given as device.bag=FILE"
         return f"{text} of this device; a recording is given by its name alone: toftrack track FILE"
+    group, _, name = key.partition(".")
+    files = sorted((configuration_folder() / group).glob("*.yaml"))
+    line = re.compile(rf"^{re.escape(name)}:", re.MULTILINE)
+    having = [file.stem for file in files if line.search(file.read_text())]
+    if having:
+        return f"{text} of this {group}; it is one of {group}={', '.join(having)}"
     if likely is not None:
         return f"{text}; did you mean {likely}?"
     where = key.rpartition(".")[0]
@@ -221,6 +227,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         where = where.rpartition(".")[0]
     inside = OmegaConf.select(root, where) if where else root
     some = [str(name) for name in inside if name not in ("_target_", "hydra")]
+    if not some:
+        return f"{text}; this {where} has none"
     if len(some) > _MOST:
         some = [*some[:_MOST], "..."]
     return f"{text}; {where or 'the configuration'} has {', '.join(some)}"

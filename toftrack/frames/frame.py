@@ -148,11 +148,11 @@ def checked_moment(index: Any, timestamp_s: Any) -> tuple[int, float]:
     """A frame's number, from 0 on, and its seconds; ToftrackError where they are none."""
     with contextlib.suppress(TypeError, ValueError, OverflowError):
         number, seconds = int(index), float(timestamp_s)
-        if number == index and number >= 0:
+        if number == index and number >= 0 and math.isfinite(seconds):
             return number, seconds
     raise ToftrackError(
-        f"the frame's index and timestamp_s must be a whole number from 0 on and seconds, but are "
-        f"{index!r} and {timestamp_s!r}"
+        f"the frame's index and timestamp_s must be a whole number from 0 on and finite seconds, "
+        f"but are {index!r} and {timestamp_s!r}"
     )
 
 

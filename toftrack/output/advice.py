@@ -255,9 +255,9 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if not found:
         which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
         found.append(
-            f"If a hand was in view, check the picture (overlay.png, unless view=none): it must be "
+            f"If a hand was in view, look at the picture (view=video or browser): it must be "
             f"{which}, upright and not mirrored (x right, y down), with nothing else nearer to "
-            "the camera, and depth_m must have the order frames, rows, columns."
+            "the camera; the depth_m of a recording has the order frames, rows, columns."
         )
     return found
 

@@ -77,8 +77,11 @@ class OscStream(UdpStream):
 def messages(line: dict[str, Any], parts: Sequence[str]) -> Iterator[Message]:
     """What is said of a frame, in order; line: as in track.jsonl, of one hand or with `hands`."""
     yield "/toftrack/frame", [("i", line["index"]), ("d", line["timestamp_s"])]
-    for hand in hands_of(line):
-        yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}", parts)
+    hands = hands_of(line)
+    for slot, hand in enumerate(hands):
+        # Of several persons, some are of one side.
+        number = f"_{slot + 1}" if len(hands) > 2 else ""
+        yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}{number}", parts)
 
 
 def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Iterator[Message]:

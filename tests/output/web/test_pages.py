@@ -202,6 +202,38 @@ def test_the_docs_cursor_follows_the_fingertip_and_a_pinch_clicks_where_it_was(
 
 GAME = "point?seed=15411478&width=1&reach=0.5"
 """The game that the sample of pointing and pinching was drawn for (docs/streams.md)."""
+
+
+def test_a_disc_is_in_the_window_whatever_becomes_of_that(stream: Any, page: Any) -> None:
+    page.set_window_size(1000, 700)
+    page.get(f"{stream.url}point?seed=7&reach=0.1")
+    before = page.execute_script("return {...game.target}")
+    page.execute_script("for (let i = 0; i < 50; i++) next()")
+    page.set_window_size(500, 800)
+    inside = (
+        "const { x, y, radius } = game.target; "
+        "return innerWidth < 700 && radius <= x && x <= innerWidth - radius"
+        " && radius <= y && y <= innerHeight - radius"
+    )
+    eventually(lambda: page.execute_script(inside))
+    after = page.execute_script("return game.target")
+    assert (after["across"], after["down"]) != (before["across"], before["down"])
+
+
+def test_the_view_has_every_hand_in_it(stream: Any, page: Any) -> None:
+    page.set_window_size(800, 700)
+    page.get(stream.url)
+    shift = np.array([0.45, 0.0, 0.0], np.float32)
+    one, other = hand_estimate(9), hand_estimate(9, "left")
+    apart = replace(other, openxr_position_m=other.openxr_position_m + shift)
+    for _ in range(60):
+        shown(page, "window.drawn?.hands === 2", lambda: stream.send((one, apart)))
+    drawn = picture_of(page)
+    columns = np.flatnonzero(drawn.any(0))
+    assert 10 < columns[0] and columns[-1] < drawn.shape[1] - 10
+    assert (np.diff(columns) > 20).any()  # two of them
+
+
 PLAY = """
 let now = 0;
 performance.now = () => now;

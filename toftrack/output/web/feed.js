@@ -12,6 +12,10 @@ function handsOf(line) {
   return hands.map((hand) => ({ ...frame, ...hand }));
 }
 
+function lostWords(hand) {
+  return hand.state_name === "lost" ? "lost" : `lost (${hand.state_name})`;
+}
+
 function follow(take, say) {
   const address = new URL("/stream", location.href);
   address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
