@@ -84,7 +84,6 @@ def test_every_field_of_an_estimate_has_a_name() -> None:
             "palm, pinching, 2 joints not ok",
         ),
         (lost_hand(2), "frame 2, 0.080 s: lost, no hand found"),
-        (hand_estimate(3, lost=True), "frame 3, 0.120 s: lost, not sure of the pose"),
     ],
 )
 def test_an_estimate_prints_itself_in_a_line(estimate: toftrack.Estimate, said: str) -> None:

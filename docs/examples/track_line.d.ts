@@ -22,7 +22,7 @@ export interface Frame {
 export interface Hand {
   /** What the tracker does: tracking, or why not. */
   state_name: "tracking" | "searching" | "other hand" | "hidden" | "out of view" | "initialising" | "lost" | "recovering";
-  /** Not to be used: no hand, or a joint that is likely off by more than 40 mm. */
+  /** Not to be used: no hand, or one of which too much is likely wrong. Of single joints: joint_ok. */
   lost: boolean;
   /** Probability that every joint is within 40 mm. */
   confidence: number | null;

@@ -35,7 +35,8 @@ class Quality:
     threads: at most. Beside another program that takes a core, helpers are waited for longer than
         they help.
     every: frames from one detection of a believed hand to the next.  search: likewise from one
-        search of the whole image to the next, while none is.  places: looked at in it, at most.
+        search of the whole image to the next, while none is followed or one is doubted.
+    places: looked at in it, at most.
     """
 
     threads: int | None = None

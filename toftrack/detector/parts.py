@@ -20,7 +20,7 @@ BACKGROUND_PART, HAND_PART, FOREARM_PART, ANOTHER_PART, THING_PART = range(SEGME
 class Parts:
     """The likeliest class of each part of a crop.
 
-    kind: (PARTS, PARTS).  turn, centre_m: (3, 3), (3,) of the crop, see crops.crop.
+    kind: (PARTS, PARTS).  turn, centre_m: (3, 3), (3,) of the crop, see crops.crop_at.
     mirrored: they are of the mirrored image.
     """
 

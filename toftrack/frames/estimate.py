@@ -68,7 +68,8 @@ class Estimate:
     'lost' or 'recovering'; of a frame of a finished run that was not tracked 'dropped'. See
     STATES."""
     lost: bool
-    """Not to be used: no hand, or a joint that is likely off by more than 40 mm."""
+    """Not to be used: no hand, or one of which too much is likely wrong, see `lost.confidence` and
+    `lost.whole` in conf/lost. Of single joints: `joint_ok`."""
     joints_m: np.ndarray
     """(21, 3) float32 metres, camera frame, in the order of JOINT_NAMES, which is MediaPipe's."""
     state: np.ndarray
@@ -93,13 +94,13 @@ class Estimate:
     """How sure that is, 0..1; 1 where it was given."""
     gesture: str = ""
     """The gesture ("palm", "pointing_thumb", ... or a name of the user's), 'other' where it is none
-    of the known; empty where gesture output is off, the hand is lost, or a joint is not ok that
-    would decide."""
+    of the known; empty where gesture output is off, the hand is lost, or too little is known of a
+    joint that would decide."""
     gesture_probability: float = math.nan
     """How sure the gesture is, 0..1; NaN where there is none."""
     pinch: float = math.nan
     """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN, which is true,
-    where gesture output is off, the hand is lost, or one of their last joints is not ok."""
+    where gesture output is off, the hand is lost, or too little is known of their last joints."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     joint_sigma_m: ArrayOnDemand = ArrayOnDemand(21, 3, kind=np.float32)
@@ -109,7 +110,7 @@ class Estimate:
     """(21,) float32 probabilities that the joints are within 40 mm; NaN where nothing says."""
     joint_ok: np.ndarray = field(default_factory=lambda: np.ones(21, bool))
     """(21,) bool: the joint may be used. False for all of a hand that is lost, and for those joints
-    of another one that are likely off by more than 40 mm: see `lost.joint_ok` in conf/lost."""
+    of another one whose `joint_confidence` is below `lost.joint_ok`, see conf/lost."""
     pointing_origin_m: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 metres, camera frame: the index finger's base while it points, with or without
     the thumb stretched away, else NaN."""
@@ -198,8 +199,6 @@ def is_vacant(estimate: Estimate) -> bool:
 
 def state_words(estimate: Estimate) -> str:
     """What goes on, for people: "tracking", "searching for the hand", "the hand is hidden"."""
-    if estimate.lost and estimate.state_name == "tracking":
-        return "not sure of the pose"
     return STATES.get(estimate.state_name, estimate.state_name)
 
 

@@ -313,11 +313,10 @@ def tell_gesture(
 ) -> tuple[GestureState | None, Estimate]:
     """The estimate with its gesture and pinch, and with the pointing ray while it points.
 
-    A hand that is lost has no gesture ("" and NaN), except one that is followed well and counts as
-    lost only because its pose is none of the pose space: this is a pose like any other. Only joints
-    that are ok are asked: a gesture that others decide is not named, and so with the pinch.
+    A hand that is lost has no gesture ("" and NaN). Only joints that are ok, or likely enough, are
+    asked: a gesture that others decide is not named, and so with the pinch.
     """
-    if gestures is None or (estimate.lost and estimate.state_name != "tracking"):
+    if gestures is None or estimate.lost:
         return None, without_gesture(estimate)
     angles = estimate.state[6:].astype(np.float64)
     off_rad = math.nan

@@ -52,10 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--topic", help="of the depth images in a ROS bag that has several")
     names = ("FX", "FY", "CX", "CY")
-    about = "pixels: the lens of bare images (a video, .npy, PNG without camera.json)"
+    about = "pixels: a lens without distortion, instead of the recording's own"
     add("--intrinsics", type=float, nargs=4, metavar=names, help=about)
     add("--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)")
-    add("--fps", type=float, help="frames a second of bare images (25)")
+    add("--fps", type=float, help="frames a second of images without times (25)")
     add("--dataset", help="the depth stack in a .h5 or .mat that has several")
     options = parser.parse_args(arguments)
     lens = None if options.intrinsics is None else tuple(options.intrinsics)

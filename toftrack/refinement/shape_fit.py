@@ -77,7 +77,7 @@ much, and so many of its standard deviations."""
 
 class SeenHand(Protocol):
     """What the pose network says of a hand: its joints, its length, and how probably there is one;
-    see detector/hand_detector.py."""
+    see detector/detection.py."""
 
     @property
     def keypoints(self) -> Keypoints: ...

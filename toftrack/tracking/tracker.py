@@ -197,7 +197,7 @@ class Tracker:
 
     @property
     def info(self) -> StepInfo | None:
-        """What the last step saw and believed; None before the first one."""
+        """What the last step saw and believed; None where it has no track."""
         return self.hands.infos[0]
 
     @property

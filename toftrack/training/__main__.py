@@ -14,7 +14,7 @@ from toftrack.programs.command_line import plain_parser, run
 _PROGRAM = "python -m toftrack.training"
 _TRAIN = f"""Trains the networks that find hands and propose poses, from nothing.
 
-  {_PROGRAM} train                     hours on two cores, minutes on a GPU
+  {_PROGRAM} train                     hours on two cores, half an hour on a GPU beside 16
   {_PROGRAM} train seed=1              settings are KEY=VALUE
   {_PROGRAM} train resume=FOLDER       an interrupted training, by its output folder
   {_PROGRAM} train --cfg job           all settings, composed

@@ -1,7 +1,7 @@
 """The things that hands hold in training images, and the hands before they close on them.
 
 In the palm, a thing's axis lies across it; between the tips of thumb and index finger, the thing is
-what fits into the room between them. Phones and hammers are left out, see grasps.
+what fits into the room between them. Phones and hammers are left out, see hands.py.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Poses that people show a camera or pass through, to train the detector on.
 
-KINDS and SHOWN say how often each is drawn; docs/detector.md has them as a table. Poses of
-hands that hold things follow from the things: hands.py.
+KINDS and SHOWN say how often each is drawn; docs/detector.md has KINDS as a table. Poses of hands
+that hold things follow from the things: hands.py.
 """
 
 from __future__ import annotations

@@ -317,7 +317,7 @@ def draw(
 ) -> np.ndarray:
     """The camera's image with the skeleton of an estimate, as the overlay video shows it.
 
-    Joints that are more likely wrong than right are hollow; an estimate that is lost has a red
+    Joints that are not ok (`Estimate.joint_ok`) are hollow; an estimate that is lost has a red
     frame around the picture, and no skeleton where it has no joints.
 
     image: on the undistorted grid of `Camera.rectify`, (H, W) floating-point metres, 0 = no

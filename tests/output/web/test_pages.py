@@ -47,7 +47,8 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """The browser, whose console must stay empty."""
+    """The browser with its usual window, whose console must stay empty."""
+    browser.set_window_size(1200, 900)
     yield browser
     assert browser.get_log("browser") == []
 
