@@ -29,6 +29,12 @@ WRONG = [
     (f"seed={10**23}", "is not possible"),
     ("seed=" + "[" * 3000 + "]" * 3000, ""),
     ("+seed.x=" + "{a:" * 400 + "1" + "}" * 400, ""),
+    ("filter.spread=3", "it has settings of its own; give these, as filter.spread.translation_m="),
+    ("gestures.pinch=null", "it has settings of its own; give these, as gestures.pinch.touching="),
+    ("likelihood=3", "a group takes the name of one of its choices"),
+    ("hand=[1,2]", "a group takes the name of one of its choices"),
+    ("experiment=null", "of experiment, none is no experiment"),
+    ("filter.spread.depth_m=1e30", "give a number of at least 0 and at most 10"),
     # What was probably meant.
     ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),
     ("particles=3", "did you mean filter.particles?"),

@@ -294,11 +294,12 @@ def test_the_command_trains_on_a_users_file_and_records_it(
     mine = write_csv(tmp_path / "mine.csv", random_angles(40).rad2deg().numpy())
     out = tmp_path / "out"
     given = ("pose_space=lle", "pose_space.dims=2", "data=file", f"data.path={mine}")
-    given += ("compare=[1]", "hydra.run.dir=out")
+    given += ("compare=[1,30]", "hydra.run.dir=out")
     status, printed, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
     assert status == 0, err
     assert "learning spaces for the table of errors" in err and "2/2" in err
     assert "40 training poses" in printed and " deg," in printed
+    assert "left out of the table: [30] dimensions; 21 are the most" in printed
     assert load_pose_space(out / "pose_space.npz").dims == 2
     header = json.loads(str(np.load(out / "pose_space.npz")["header"]))
     assert header["sources"][0]["file"] == "mine.csv"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -125,6 +126,16 @@ def ends(*_: object) -> None:
     os._exit(1)
 
 
+def asked_to_end(n: int, bank: ShapeBank, generator: torch.Generator) -> images.WideImages:
+    os.kill(os.getpid(), signal.SIGTERM)
+    return noise(n, bank, generator)
+
+
+def test_a_process_that_makes_batches_leaves_its_end_to_the_one_that_learns() -> None:
+    made = batches.made_batches(Batches(asked_to_end, 2, 1, 0), range(2), 1)
+    assert len(list(made)) == 2
+
+
 def test_a_process_that_ends_while_it_makes_batches_is_an_error() -> None:
     ended = pytest.raises(ToftrackError, match="makes training images has ended")
     with ended, batches.makers_watched():
@@ -167,12 +178,23 @@ def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> Non
     assert "poses" in done.stderr and "finder" in done.stderr, "progress bars"
 
 
-def test_the_program_refuses_what_cannot_be(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ("shapes=0", "shapes"),
+        ("poses.batch=0", "poses: batch"),
+        ("poses.start=none.npz", "there are no weights of the detector at "),
+        ("output=none/weights.npz", "output=none/weights.npz is not possible"),
+    ],
+)
+def test_the_program_refuses_what_cannot_be_before_it_trains(
+    given: str, said: str, tmp_path: Path
+) -> None:
     program = str(ROOT / "toftrack" / "training" / "__main__.py")
-    given = ("train", "shapes=0", "hydra.run.dir=out")
-    status, _, err = programs.call(*given, folder=tmp_path, program=program)
+    words = ("train", given, "hydra.run.dir=out")
+    status, _, err = programs.call(*words, folder=tmp_path, program=program)
     assert status == 1
-    assert err.splitlines()[-1].startswith("error: shapes")
+    assert err.splitlines()[-1].startswith(f"error: {said}")
 
 
 class SwitchedOffError(Exception):

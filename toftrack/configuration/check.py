@@ -49,8 +49,13 @@ _ABOVE_ZERO = frozenset(
     view.most_fps view.quality
     """.split()
 )
-_AT_MOST = {"hands": MOST_HANDS, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62}
-"""More particles or passes than these take minutes a frame; larger seeds are none for torch."""
+_AT_MOST = {
+    **{"hands": MOST_HANDS, "filter.particles": 100_000, "filter.passes": 1000, "seed": 2**62},
+    **{"filter.shrink": 10, "filter.spread.translation_m": 10, "filter.spread.depth_m": 10},
+    **{"filter.spread.rotation_rad": 10, "detector.keypoint_weight": 1000},
+}
+"""More particles or passes than these take minutes a frame; larger seeds are none for torch, and
+the others leave numbers behind."""
 _OPEN_ENDED = frozenset({"segmentation.reach_m", "view.linger_s", "view.wait_s"})
 """Infinity is a value of these."""
 MOST_VALUES = 5000
@@ -158,7 +163,7 @@ def check_groups(config: DictConfig) -> None:
         if not (needless or isinstance(config.get(group), DictConfig)):
             raise ToftrackError(
                 f"the configuration has no {group}; add '- {group}: {choice}' to the defaults of "
-                "your config.yaml"
+                f"your config.yaml, or leave ~{group} out"
             )
 
 
@@ -202,6 +207,12 @@ def _check_value(key: str, value: object, usual: object) -> None:
         most = _AT_MOST.get(key, math.inf)
         above, whole = key in _ABOVE_ZERO, isinstance(usual, int)
         check_number(key, value, least, most, above=above, whole=whole)
+    elif isinstance(usual, dict):  # and the value is none
+        name = next((name for name in usual if name != "_target_"), "NAME")
+        raise ToftrackError(
+            f"{key}={value} is not possible: it has settings of its own; give these, as "
+            f"{key}.{name}=VALUE"
+        )
     elif isinstance(usual, list) and not isinstance(value, list):
         raise ToftrackError(f"{key}={value} is not possible; give a list, as [{value}]")
 

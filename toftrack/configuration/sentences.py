@@ -23,6 +23,8 @@ _ALIKE, _MOST = 0.6, 12
 """How much of a name must be right, 0..1; so many names are listed at most."""
 _MEANT = {"K": "intrinsics", "web": "browser"}
 """What other programs call a setting or a choice."""
+_DEFAULTS_LIST = "hydra._internal.defaults_list"
+"""Where Hydra looks up choices."""
 _HYDRAS = ("joblib", "optuna", "ray")
 """Launchers and sweepers of Hydra that are extras of the package."""
 _PAPERS_GROUP = "start"
@@ -58,13 +60,20 @@ def sentence(error: BaseException) -> str:
             "name, and that its module lies in the folder of --config-dir, on PYTHONPATH, or is "
             "installed"
         )
+    text = _one_line(str(error))
+    if deleted := re.match(r"Key '([^']+)' is not in struct", text):
+        return f"the configuration lacks {deleted[1]}; leave ~{deleted[1]} out"
     if isinstance(error, (HydraException, OmegaConfBaseException)):
         reported = next((cause for cause in chain if str(cause).strip()), error)
         said = _of_config(reported) + place_of(chain[-1])
         return _of_override(chain) or said or type(error).__name__
-    text = _one_line(str(error))
-    if text.startswith("Config group override must be"):
-        return "a group was given a number, as likelihood=nan; give a choice's name, GROUP=NAME"
+    *_, (last, _) = [(None, 0), *traceback.walk_tb(error.__traceback__)]
+    of_groups = last is not None and last.f_globals.get("__name__") == _DEFAULTS_LIST
+    if of_groups or text.startswith("Config group override must be"):
+        return (
+            "a group takes the name of one of its choices, as likelihood=f_measure, and no null, "
+            "number or list; of experiment, none is no experiment"
+        )
     name = type(error).__name__ + (f": {text}" if text else "") + place_of(error)
     return f"unexpected {name} ({FULL_ERROR}=1 shows the traceback)"
 

@@ -178,11 +178,11 @@ class Sample(Replay):
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:
     stop = count if stop is None else stop
-    check_number("start", start, whole=True)
-    check_number("stop", stop, whole=True)
+    check_number("device.start", start, whole=True)
+    check_number("device.stop", stop, whole=True)
     if not 0 <= start < stop <= count:
         raise ToftrackError(
-            f"the frames from start={start} to stop={stop} do not lie in '{path}', which has "
-            f"{count} frames; choose 0 <= start < stop <= {count}"
+            f"the frames from device.start={start} to device.stop={stop} do not lie in '{path}', "
+            f"which has {count} frames; choose 0 <= start < stop <= {count}"
         )
     return range(start, stop)

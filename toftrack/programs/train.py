@@ -14,7 +14,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.files.safe_files import write_whole
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
@@ -52,6 +52,8 @@ def train(config: DictConfig) -> float:
     settings.pop("data", None)  # of the tracker's; here the group of this name says it
     kind, dims = settings.pop("kind"), settings.pop("dims")
     folder = Path(HydraConfig.get().runtime.output_dir)
+    for number in config.compare:
+        check_number("a number of compare", number, 1, whole=True)
     data: PoseData = hydra.utils.instantiate(config.data)
     say = print if not in_sweep() else lambda text: None  # a sweep's jobs say one line each
     for note in data.notes:
@@ -59,7 +61,10 @@ def train(config: DictConfig) -> float:
     space = fit_pose_space(kind, dims, data, **settings)
     clips = len(data.clips.unique())
     say(f"{len(data)} training poses in {clips} clips, {kind}, {dims} dimensions")
-    wanted = [number for number in config.compare if number < min(len(data) - 1, 22)]
+    most = min(len(data) - 2, 21)
+    wanted = [number for number in config.compare if number <= most]
+    if left := [number for number in config.compare if number > most]:
+        say(f"left out of the table: {left} dimensions; {most} are the most that can be learned")
     rows = _table(kind, sorted({*wanted, dims}), data, settings)
     say(errors_table(rows))
     if rows[0].variance is not None and [s["data"] for s in data.sources] == ["synthetic"]:
@@ -99,7 +104,8 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
     """A row of errors for each number of dimensions, with progress where that takes long."""
     with tqdm(
         total=len(dims) * spaces_to_learn(data),
-        desc="learning spaces for the table of errors (compare=[] takes fewer)",
+        desc="learning spaces for the table of errors"
+        + (" (compare=[] takes fewer)" if len(dims) > 1 else ""),
         file=sys.stderr,
         unit=" spaces",
         delay=_SILENT_S,

@@ -10,8 +10,10 @@ import contextlib
 import ctypes
 import functools
 import os
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from typing import Any
 
 import torch
@@ -97,8 +99,27 @@ def made_batches(batches: Batches, numbers: range, makers: int) -> Iterator[Any]
         prefetch_factor=_READY,
         generator=torch.Generator(),
     )
-    for made in loader:
+    with _for_this_process_alone():
+        made_by_others = iter(loader)
+    for made in made_by_others:
         yield type(made)(*map(torch.from_numpy, made))
+
+
+@contextlib.contextmanager
+def _for_this_process_alone() -> Iterator[None]:
+    """Processes that are started within do not end when their group is asked to, as by Ctrl-C: this
+    one lets them go, and else it would be told that they died.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    resource_tracker.ensure_running()  # which lets signals through when it begins
+    asked = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, asked)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager

@@ -6,16 +6,26 @@ import json
 import math
 import os
 from pathlib import Path
+from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
-from toftrack.errors import check_number
+from toftrack.configuration.sentences import sentence
+from toftrack.errors import ToftrackError, check_number
 from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import sweep_job
 from toftrack.views.pictures import write_picture
+
+
+def _schedule(config: DictConfig, name: str) -> Any:
+    try:
+        return hydra.utils.instantiate(config[name])
+    except HydraException as error:
+        raise ToftrackError(f"{name}: {sentence(error)}") from None
 
 
 @sweep_job
@@ -31,7 +41,6 @@ def train(config: DictConfig) -> float:
     from toftrack.api import compute_device
     from toftrack.detector.onnx_networks import COMMAND
     from toftrack.detector.weights import load_weights, save_weights
-    from toftrack.errors import ToftrackError
     from toftrack.training.checkpoints import Checkpoints
     from toftrack.training.descent import train_finder, train_poses
     from toftrack.training.figures import course_figure, images_figure
@@ -47,8 +56,15 @@ def train(config: DictConfig) -> float:
         )
     found = "cuda" if torch.cuda.is_available() else "cpu"
     device = compute_device(found if config.compute == "auto" else config.compute)
-    poses = hydra.utils.instantiate(config.poses)
-    finder = hydra.utils.instantiate(config.finder)
+    if path.suffix != ".npz" or not path.parent.is_dir():
+        raise ToftrackError(
+            f"output={config.output} is not possible; give a name that ends in .npz, in a folder "
+            "that there is"
+        )
+    poses, finder = (_schedule(config, name) for name in ("poses", "finder"))
+    for schedule in (poses, finder):
+        if schedule.start is not None:
+            load_weights(schedule.start)  # an error now, not after hours
     if not (isinstance(config.shapes, int) and config.shapes > 0):
         raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
     check_number("checkpoint_minutes", config.checkpoint_minutes, 0, above=True)
