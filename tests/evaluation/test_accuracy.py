@@ -69,6 +69,7 @@ def test_differences_to_an_earlier_measurement_are_reported(measurement, folder,
     assert found["pairs"] == 2 and found["differences"]["silent_pct"]["recordings"] == 2
     # The same seed gives the same figures, in another run, too.
     assert found["differences"]["mean_all_mm"]["mean"] == 0
+    assert "intervals of fewer than 5 recordings say little" in said
     assert "2 only here, not compared: short/a, seed 2; short/b, seed 2" in said
     assert "2 only there, not compared: short/a, seed 0; short/b, seed 0" in said
 

@@ -164,7 +164,7 @@ def test_what_the_finder_sees_is_looked_at_at_once_but_a_frame_later_while_all_h
 def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
     _, _, asked = looked(known(), found=FOUND)
     places = asked.for_next_frame()
-    again, seen, asked = looked(known(), found=FOUND, found_s=FRAME_S, places=places)
+    again, seen, asked = looked(known(), found=FOUND, searched_s=FRAME_S, places=places)
     assert not asked.asked and not len(asked.for_next_frame().centre_m)
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
@@ -221,7 +221,7 @@ def test_the_finder_is_asked_every_so_many_frames_and_half_as_often_while_all_ha
     every = search * times
     for frames, due in ((every - 1, every == 1), (every, True)):
         detector = FixedDetector(search=search)
-        looked(*tracks, detector=detector, found_s=frames * FRAME_S)
+        looked(*tracks, detector=detector, searched_s=frames * FRAME_S)
         assert bool(detector.images) == due
 
 

@@ -213,11 +213,11 @@ def test_a_tentative_track_ends_beside_a_confirmed_one_but_not_alone() -> None:
 
 
 def test_time_goes_on_with_the_images_and_not_where_a_clock_goes_back() -> None:
-    state = replace(state_of(timestamp_s=1.0), found_s=0.2)
+    state = replace(state_of(timestamp_s=1.0), searched_s=0.2)
     state = replace(state, slots=(replace(state.slots[0], away_s=0.1),))
     for now_s, passed in ((1.5, 0.5), (0.2, 0.0), (float("nan"), 0.0)):
         later = state.at(replace(IMAGE, index=7, timestamp_s=now_s))
-        assert later.found_s == pytest.approx(0.2 + passed) and later.next_index == 8
+        assert later.searched_s == pytest.approx(0.2 + passed) and later.next_index == 8
         assert later.slots[0].away_s == pytest.approx(0.1 + passed)
 
 

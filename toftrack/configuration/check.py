@@ -72,7 +72,7 @@ _OF_NETWORKS = {
 """What the tracker with networks alone has: settings, their values, and how these are given."""
 _OF_PAPER = {
     "start._target_": ("toftrack.tracking.paper.RoughStart", "start=rough"),
-    "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=never"),
+    "lost._target_": ("toftrack.tracking.paper.ScoreThreshold", "lost=score"),
 }
 """Likewise the paper's."""
 _GROUPS = {"detector": "network", "renderer": "auto", "posterior": "default"}

@@ -115,7 +115,8 @@ class HandDetector:
     ) -> Callable[[], Places]:
         """Where hands may be, the first part of a search; begun beside whatever can do without.
 
-        known: so many hands are, which are among these places.
+        known: hands that are followed: the finder sees them, too, so that so many more places are
+            given.
         """
         cfg = self.settings
         return start_finding(self.finder, depth_m, k, cfg.places + known, cfg.least)

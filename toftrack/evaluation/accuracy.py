@@ -173,8 +173,13 @@ def notes_of(result: dict[str, Any]) -> list[str]:
     notes = []
     if result["workers"] > 1:
         notes.append("note: milliseconds were measured beside other processes of this run")
+    comparison = result.get("comparison") or {}
+    counts = [one["recordings"] for one in comparison.get("differences", {}).values()]
+    if 1 < max(counts, default=0) < results.FEWEST_FOR_A_STAR:
+        fewest = results.FEWEST_FOR_A_STAR
+        notes.append(f"note: intervals of fewer than {fewest} recordings say little, and get no *")
     for where in ("here", "there"):
-        left = (result.get("comparison") or {}).get(f"only_{where}", ())
+        left = comparison.get(f"only_{where}", ())
         if left:
             some = "; ".join(left[:6]) + ("; ..." if len(left) > 6 else "")
             notes.append(f"note: {len(left)} only {where}, not compared: {some}")

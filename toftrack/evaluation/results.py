@@ -32,7 +32,7 @@ from toftrack.files.safe_files import check_replaceable, write_whole
 FORMAT = "toftrack accuracy 1"
 Table = list[list[str]]
 """Rows of cells, the heads first; the first column is text."""
-_FEWEST_FOR_A_STAR = 5
+FEWEST_FOR_A_STAR = 5
 """Recordings; fewer, drawn again, are too much alike for an interval to be believed."""
 
 
@@ -218,7 +218,7 @@ def difference_table(differences: Mapping[str, Mapping[str, Any]]) -> Table:
 
 def clear_mark(of: Mapping[str, Any]) -> str:
     """A star for a difference whose interval, over enough recordings, does not hold 0."""
-    enough = of["recordings"] >= _FEWEST_FOR_A_STAR
+    enough = of["recordings"] >= FEWEST_FOR_A_STAR
     return "*" if enough and (of["low"] > 0 or of["high"] < 0) else ""
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from typing import Any, Self, overload
 
 import numpy as np
@@ -57,16 +57,17 @@ class ArrayOnDemand:
 @fields_in_help
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate."""
+    """The hand in one frame, on the host. Arrays are NaN where there never was an estimate and, of
+    several slots, where there is no hand now."""
 
     index: int
     """Number of the input frame."""
     timestamp_s: float
     """Seconds, the frame's time as it was given."""
     state_name: str
-    """'tracking', or why not: 'searching', 'hidden', 'out of view', 'other hand', 'initialising',
-    'lost' or 'recovering'; of a frame of a finished run that was not tracked 'dropped'. See
-    STATES."""
+    """'tracking', or why not: 'searching', 'hidden', 'out of view', 'other hand' or 'lost'; with
+    experiment=paper also 'recovering', and 'initialising' of its first frame; of a frame of a
+    finished run that was not tracked 'dropped'. See STATES."""
     lost: bool
     """Not to be used: no hand, or one of which too much is likely wrong, see `lost.confidence` and
     `lost.whole` in conf/lost. Of single joints: `joint_ok`."""
@@ -177,8 +178,7 @@ def no_estimate(
 
 def lost_estimate(last: Estimate, index: int, timestamp_s: float, compute_s: float) -> Estimate:
     """The estimate of a frame in which no hand can be: the last one stands, and is lost."""
-    return replace(
-        last,
+    return last.updated(
         index=index,
         timestamp_s=timestamp_s,
         state_name="lost",

@@ -21,17 +21,24 @@ def in_all_conventions(
 
     shape: the hand of the estimate.  k: (3, 3) intrinsics, pixels.  size_px: width, height.
     """
-    joints, state, k = estimate.joints_m, estimate.state, k.copy()
+    joints, state = estimate.joints_m, estimate.state
 
     @functools.cache
     def hand() -> OpenXRHand:
         return openxr_hand(joints, state, openxr_rig(shape))
 
-    return estimate.updated(
-        landmarks=lambda: np.round(image_landmarks(joints, k, size_px), _DECIMALS),
+    return with_landmarks(estimate, k, size_px).updated(
         openxr_position_m=lambda: np.round(hand().position_m, _DECIMALS),
         openxr_orientation=lambda: np.round(hand().orientation, _DECIMALS),
         openxr_radius_m=lambda: np.round(hand().radius_m, _DECIMALS),
+    )
+
+
+def with_landmarks(estimate: Estimate, k: np.ndarray, size_px: tuple[int, int]) -> Estimate:
+    """The estimate with its landmarks in an image; k and size_px as of in_all_conventions."""
+    joints, k = estimate.joints_m, k.copy()
+    return estimate.updated(
+        landmarks=lambda: np.round(image_landmarks(joints, k, size_px), _DECIMALS)
     )
 
 

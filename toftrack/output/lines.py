@@ -1,6 +1,7 @@
 """Estimates as lines of track.jsonl, and what each field is in the arrays of track.npz.
 
-Both follow from the fields of Estimate: a new one is in the files by itself.
+Both follow from the fields of Estimate: a new one is in the files by itself, and files without
+it are read no more.
 """
 
 from __future__ import annotations

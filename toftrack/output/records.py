@@ -22,6 +22,7 @@ from typing import IO, Any
 import numpy as np
 from tqdm import tqdm
 
+from toftrack.errors import ToftrackError
 from toftrack.files.archives import Pieces, write_archive
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.estimate import Estimate, is_vacant, no_estimate
@@ -79,6 +80,11 @@ class Records:
                     bar.update(len(piece))
         except BaseException as error:
             records.close()
+            if isinstance(error, KeyError) and error.args[0] in KINDS:
+                raise ToftrackError(
+                    f"'{lines}' is of another toftrack: its lines have no '{error.args[0]}'; take "
+                    "the one that 'toftrack' in run.json names"
+                ) from None
             if isinstance(error, (ArithmeticError, LookupError, TypeError, ValueError)):
                 raise damaged(lines, last, f"it or one shortly before: {error!r}") from None
             raise

@@ -59,7 +59,7 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     followed = bool(scene.hands) and all(hand.track.reliable for hand in scene.hands)
     urgent = not followed or scene.dt_s > _RARE_S
     frames = detector.settings.search * (1 if urgent else _FOLLOWED)
-    due = frames == 1 or Duration(state.found_s).reached(frames)
+    due = frames == 1 or Duration(state.searched_s).reached(frames)
     search = partial(detector.start_search, image.depth_m, image.k, len(scene.hands))
     finder: Callable[[], Places] = no_places
     if due and urgent:  # what is waited for first is begun first
@@ -84,8 +84,8 @@ def finish_detection(
     places = pending.finder() if pending.at_once else state.places
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
-    known = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
-    places = _apart_from(known, places)
+    believed = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
+    places = _apart_from(believed, places)
     found = _elsewhere(scene, state, places, rare) if len(places.centre_m) else []
     arms = _arms(scene, seen) if found and not rare else []
     return seen + [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
@@ -147,8 +147,8 @@ def _elsewhere(
     seen: list[SideDetection] = []
     for side in sorted(missing, reverse=True):  # right first
         # A hand that is hardly seen may look like one of the other side.
-        known = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
-        there = _apart_from(known, places)
+        others = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
+        there = _apart_from(others, places)
         if len(there.centre_m):
             image = scene.image if rare else scene.unexplained
             found = scene.model.detector.look(image.depth_m, image.k, there, side)

@@ -34,7 +34,7 @@ class PosteriorWeights:
     """The weights of the posterior's terms, see conf/posterior; a term of weight 0 is left out.
 
     overlap: of fingers in one another. Else what is no hand, such as an elbow, looks like one with
-        overlapping fingers: without this term a fresh draw is usable in 28 instead of 91 %.
+        overlapping fingers: without this term one recording was lost (docs/lab/ablation.md).
     """
 
     keypoints: float

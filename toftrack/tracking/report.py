@@ -22,7 +22,7 @@ from toftrack.compute.transfer import on_device, on_host
 from toftrack.frames.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames.frame import DepthImage
 from toftrack.gestures.recognition import tell_gesture
-from toftrack.hand.conventions import in_all_conventions
+from toftrack.hand.conventions import in_all_conventions, with_landmarks
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.association import least_cost
 from toftrack.tracking.candidates import View
@@ -204,6 +204,8 @@ def report_absence(
     if count > 1:
         return changed(slot, track=-1, gesture=None), nothing
     estimate = lost_estimate(slot.last, image.index, image.timestamp_s, math.nan)
+    height, width = image.depth_m.shape
+    estimate = with_landmarks(estimate, image.k, (width, height))
     gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
     return changed(slot, track=-1, gesture=gesture), estimate
 

@@ -149,7 +149,8 @@ class TrackerState:
     generator: the state of the random generator, as torch.Generator.get_state() gives it.
     tracks: in the order in which they began.  slots: as many as hands are asked for.
     told: the side of the first slot that the user said; None = nobody did.
-    places: the finder's in the last frame, used in the next.  found_s: since it was last asked.
+    places: what the finder saw in the last frame and nobody waited for; looked at in the next,
+        unless the finder is waited for there.  searched_s: since it was last asked.
     next_track, next_index: numbers of the next track, and of the next frame without one.
     timestamp_s: of the last frame, None before any.
     """
@@ -159,7 +160,7 @@ class TrackerState:
     told: str | None = None
     tracks: tuple[Track, ...] = ()
     places: Places = NO_PLACES
-    found_s: float = math.inf
+    searched_s: float = math.inf
     next_track: int = 0
     next_index: int = 0
     timestamp_s: float | None = None
@@ -183,7 +184,7 @@ class TrackerState:
         return changed(
             self,
             slots=tuple(changed(slot, away_s=slot.away_s + passed) for slot in self.slots),
-            found_s=self.found_s + passed,
+            searched_s=self.searched_s + passed,
             next_index=image.index + 1,
             timestamp_s=image.timestamp_s,
         )

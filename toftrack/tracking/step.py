@@ -93,7 +93,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     state = changed(
         state,
         places=places,
-        found_s=0.0 if pending.asked else state.found_s,
+        searched_s=0.0 if pending.asked else state.searched_s,
         next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )

@@ -143,7 +143,7 @@ class HandsTracker:
 
     @property
     def insights(self) -> tuple[StepInfo | None, ...]:
-        """What the last step saw and believed of each; None where nothing could be a hand."""
+        """The infos, but None where nothing could be a hand, as experiment=paper alone tells."""
         return tuple(
             None if info is None or info.observation.empty else info for info in self.infos
         )

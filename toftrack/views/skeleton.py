@@ -36,7 +36,7 @@ def draw_hands(
     """Draw the skeletons of the slots into the camera's image, in place, as wide as 4 mm would look
     there; of several hands the nearer over the farther, each outlined in its slot's colour and with
     its side below the wrist. Joints that are not ok are hollow, and the bones that end there
-    dashed; of several hands all of one that is lost.
+    dashed, but for those of a single hand that is lost; of several hands all of one that is.
 
     scale: picture pixels per image pixel, across and down.
     """
