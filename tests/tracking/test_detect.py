@@ -103,6 +103,8 @@ def test_the_pose_network_is_asked_about_a_sure_hand_only_every_few_frames(
     for every, expected in ((3, due), (1, True)):
         detector, *_ = looked(track, detector=FixedDetector(every=every))
         assert bool(detector.sides) == expected
+    detector, *_ = looked(track, detector=FixedDetector(every=1), dt_s=1 / 90)
+    assert detector.sides, "in every frame, however often they come"
 
 
 @pytest.mark.parametrize("factor", [0.7, 1.2])

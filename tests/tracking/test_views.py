@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
@@ -19,6 +20,9 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import Duration
+from toftrack.detector.crops import crop_rotation
+from toftrack.detector.network import PARTS
+from toftrack.detector.parts import THING_PART, Parts
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
@@ -73,6 +77,13 @@ def test_a_track_goes_on_where_it_is_predicted(found: SideDetection | None) -> N
     assert view is not None and view.track.age == Duration(1.0)
     assert view.detection.empty == (found is None)
     torch.testing.assert_close(view.track.pose, HERE)
+
+
+def test_what_was_a_thing_in_the_hand_is_one_until_the_network_looks_again() -> None:
+    wrist = detection_of(HERE).keypoints.points_m[9].double().numpy()
+    kind = np.full((PARTS, PARTS), THING_PART, np.uint8)
+    view = gone_on(None, parts=Parts(kind, crop_rotation(wrist), wrist, False))
+    assert view is not None and view.observation.thing is not None
 
 
 def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand() -> None:

@@ -39,6 +39,19 @@ def test_a_recording_without_a_hand_is_lost_in_every_frame(scene: np.ndarray) ->
         assert (estimate.index, estimate.timestamp_s) == (i, i / 25)
 
 
+@pytest.mark.parametrize("blank", [1, 3])
+def test_images_without_readings_do_not_end_a_track_unless_they_are_many(blank: int) -> None:
+    scene, tracker = sample(), make_tracker()
+    numbers = []
+    for i in range(20):
+        gone = 8 <= i < 8 + blank or i >= 12
+        depth = np.zeros_like(scene.depth_m[i]) if gone else scene.depth_m[i]
+        estimate = tracker.step(depth, scene.k, i, i / 25)
+        assert estimate.lost == gone
+        numbers.append([track.number for track in tracker.state.tracks])
+    assert numbers[:12] == [[0]] * 12 and numbers[-1] == []
+
+
 def test_no_number_is_no_reading_to_the_networks_too() -> None:
     scene, found = sample(), []
     for nothing in (0.0, np.nan, np.inf, -1.0):

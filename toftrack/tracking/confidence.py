@@ -462,8 +462,7 @@ def judge(
     whole = kept * track.whole_odds + (1 - kept) * model.whole_odds(features)
     confidence, probable = probability(smooth), probability(whole)
     # What was dropped between two frames was not doubtful: a frame counts twice FRAME_S at most.
-    passed = min(dt_s, 2 * FRAME_S) if track.doubtful.begun else FRAME_S
-    doubtful = Duration(track.doubtful.seconds + passed)
+    doubtful = track.doubtful.extended(dt_s, 2 * FRAME_S)
     doubtful = doubtful if confidence < model.give_up else Duration()
     likely = track.likely.extended(dt_s, FRAME_S) if confidence >= model.believe else Duration()
     at_once = confidence >= model.believe_at_once

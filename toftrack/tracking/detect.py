@@ -110,7 +110,8 @@ def _is_asked(scene: Scene, row: int, state: TrackerState) -> bool:
     if rests(scene, row, state):
         return False
     track, settings = scene.hands[row].track, scene.model.detector.settings
-    waited = Duration(track.asked_s + scene.dt_s).reached(settings.every)
+    every = settings.every
+    waited = every == 1 or Duration(track.asked_s + scene.dt_s).reached(every)
     return not _is_sure(scene, row) or waited or comparison_due(track, scene.dt_s)
 
 

@@ -8,7 +8,7 @@ from itertools import compress
 
 import torch
 
-from toftrack.compute.pace import Spans
+from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.compute.threads import small_operations
 from toftrack.detector.flying_pixels import without_flying_pixels
 from toftrack.frames.estimate import Estimate
@@ -83,10 +83,10 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         moved = [view for view in views if view.track.cloud not in filtered]
         filtered |= filter_tracks(moved, state, dt_s, model, seed, spans)
     results = [update_track(view, filtered[view.track.cloud], scene, spans) for view in views]
-    resting = [
-        rest_track(scene, row)
+    unseen = [
+        rest_track(scene, row) if rests(scene, row, state) else miss_track(scene, row)
         for row in rows
-        if continued[row] is None and rests(scene, row, state)
+        if continued[row] is None
     ]
     with spans("detector"):
         places = pending.for_next_frame()
@@ -97,7 +97,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )
-    state = keep_tracks(state, [*resting, *(result.track for result in results)], model)
+    state = keep_tracks(state, [*unseen, *(result.track for result in results)], model)
     return report(state, results, scene, spans)
 
 
@@ -112,6 +112,19 @@ def rest_track(scene: Scene, row: int) -> Track:
         age=track.age.extended(dt_s),
         asked_s=track.asked_s + dt_s,
         evidence=track.evidence.later(dt_s),
+    )
+
+
+def miss_track(scene: Scene, row: int) -> Track:
+    """The track of a row after a frame in which no hand can be where it is expected, as one without
+    readings: it is doubtful, and so gone after a few of them.
+    """
+    track, dt_s = scene.hands[row].track, scene.dt_s
+    return changed(
+        rest_track(scene, row),
+        likely=Duration(),
+        doubtful=track.doubtful.extended(dt_s, 2 * FRAME_S),
+        believed_s=track.believed_s + dt_s,
     )
 
 

@@ -14,7 +14,14 @@ from toftrack.refinement import shape_fit
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.association import SideDetection
-from toftrack.tracking.candidates import View, best_start, image_term, with_parts, without_things
+from toftrack.tracking.candidates import (
+    View,
+    as_last_seen,
+    best_start,
+    image_term,
+    with_parts,
+    without_things,
+)
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
@@ -43,8 +50,8 @@ def continue_track(
 
     The track restarts where the finder's detection is elsewhere, or the other side is likelier.
     """
-    if seen is None:
-        return view
+    if seen is None:  # what is in the hand hardly moves until the network looks again
+        return view and as_last_seen(view)
     detection, palm = seen.detection, scene.hands[row].palm_m[0]
     away = float(np.linalg.norm(detection.centre_m.numpy() - palm))
     moved = seen.row < 0 and away > SAME_PLACE_M
