@@ -63,13 +63,19 @@ def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> Non
 
 def test_hands_of_several_persons_have_the_numbers_of_their_slots(receiver: socket.socket) -> None:
     host, port = receiver.getsockname()
-    hands = hand_estimate(0), hand_estimate(0, "left"), hand_estimate(0)
+    right, left, vacant = (
+        hand_estimate(0),
+        hand_estimate(0, "left"),
+        no_estimate(0, 0.0, "lost", 4, 0.0),
+    )
+    said = []
     with osc_stream(host=host, port=port) as stream:
-        stream.send(hands)
-        addresses = [message.address for message in OscBundle(receiver.recv(65535))]
-    assert len(set(addresses)) == len(addresses)
-    tracked = [address for address in addresses if address.endswith("/tracked")]
-    assert tracked == [f"/toftrack/{hand}/tracked" for hand in ("right_1", "left_2", "right_3")]
+        for hands in ((right, left, right), (right, vacant, right)):
+            stream.send(hands)
+            addresses = [message.address for message in OscBundle(receiver.recv(65535))]
+            assert len(set(addresses)) == len(addresses)
+            said.append([one.split("/")[2] for one in addresses if one.endswith("/tracked")])
+    assert said == [["right_1", "left_2", "right_3"], ["right_1", "right_3", "left_2"]]
 
 
 def test_a_hand_of_which_nothing_is_said_any_more_is_told_lost_once(

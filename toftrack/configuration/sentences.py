@@ -226,7 +226,7 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
     group, _, name = key.partition(".")
     files = sorted((configuration_folder() / group).glob("*.yaml"))
     line = re.compile(rf"^{re.escape(name)}:", re.MULTILINE)
-    having = [file.stem for file in files if line.search(file.read_text())]
+    having = [file.stem for file in files if line.search(file.read_text("utf-8"))]
     if having:
         return f"{text} of this {group}; it is one of {group}={', '.join(having)}"
     if likely is not None:

@@ -60,7 +60,8 @@ class OscStream(UdpStream):
     def datagram(self, estimates: Sequence[Estimate]) -> bytes:
         """The bundle, to be acted upon at once."""
         bundle = self._bundles.OscBundleBuilder(self._bundles.IMMEDIATELY)
-        said = list(messages(line_content(estimates, self._names), self._parts))
+        line, numbered = line_content(estimates, self._names), len(estimates) > 2
+        said = list(messages(line, self._parts, numbered))
         # Of a hand of which nothing is said any more, a receiver would hold the last word for ever.
         told = {address: bool(one[0][1]) for address, one in said if address.endswith("/tracked")}
         said += [(address, [("i", 0)]) for address in sorted(self._tracked - told.keys())]
@@ -74,13 +75,14 @@ class OscStream(UdpStream):
         return content
 
 
-def messages(line: dict[str, Any], parts: Sequence[str]) -> Iterator[Message]:
-    """What is said of a frame, in order; line: as in track.jsonl, of one hand or with `hands`."""
+def messages(line: dict[str, Any], parts: Sequence[str], numbered: bool) -> Iterator[Message]:
+    """What is said of a frame, in order; line: as in track.jsonl, of one hand or with `hands`.
+
+    numbered: addresses have the slots' numbers, as of several persons some hands are of one side.
+    """
     yield "/toftrack/frame", [("i", line["index"]), ("d", line["timestamp_s"])]
-    hands = hands_of(line)
-    for slot, hand in enumerate(hands):
-        # Of several persons, some are of one side.
-        number = f"_{slot + 1}" if len(hands) > 2 else ""
+    for hand in hands_of(line):
+        number = f"_{hand['slot'] + 1}" if numbered else ""
         yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}{number}", parts)
 
 
