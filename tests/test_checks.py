@@ -10,6 +10,10 @@ import pytest
 from toftrack.errors import ToftrackError, check_number
 
 
+def test_a_sentence_stays_one_however_much_of_a_file_is_in_it() -> None:
+    assert len(str(ToftrackError("the file says " + 10_000 * "x"))) < 2100
+
+
 @pytest.mark.parametrize("value", [0, 0.5, 1, np.float32(0.5), np.int64(1)])
 def test_numbers_within_the_bounds_are_fine(value: object) -> None:
     check_number("group.key", value, 0, 1)

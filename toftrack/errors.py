@@ -14,15 +14,16 @@ from typing import Any
 MOST_HANDS = 8
 """That are followed at once."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]+")
-_LONGEST_REASON = 300
-"""Some libraries repeat the whole input."""
+_LONGEST, _LONGEST_REASON = 2000, 300
+"""Letters of a message, and of a library's words in it: some repeat the whole input."""
 
 
 class ToftrackError(Exception):
     """Bad input or environment; the message is one clear sentence: what, where, what to do."""
 
     def __str__(self) -> str:
-        return one_line(super().__str__())
+        text = one_line(super().__str__())
+        return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
 
 
 def one_line(text: str) -> str:

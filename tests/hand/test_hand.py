@@ -2,6 +2,9 @@
 
 import dataclasses
 import json
+import math
+from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -154,3 +157,27 @@ def test_the_fingers_of_the_mean_hand_point_and_bend_as_they_do() -> None:
     )
     assert (frames[:, :, 0] - axes).norm(dim=1).max() < 0.01
     assert (-frames[:, :, 1] - directions).norm(dim=1).max() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("thickness", -1.0),
+        ("thickness", math.nan),
+        ("bone_lengths_m", -0.03),
+        ("bone_lengths_m", 1e6),
+        ("base_m", math.inf),
+        ("base_frames", 0.5),
+    ],
+)
+def test_numbers_that_make_no_hand_are_refused(key: str, value: float, tmp_path: Path) -> None:
+    default_hand_shape().save(tmp_path / "hand.json")
+    content = json.loads((tmp_path / "hand.json").read_text())
+    place: Any = content
+    at: Any = key
+    while isinstance(place[at], list):
+        place, at = place[at], 0
+    place[at] = value
+    (tmp_path / "hand.json").write_text(json.dumps(content))
+    with pytest.raises(ToftrackError, match="hand.json is a damaged hand shape file: its numbers"):
+        HandShape.load(tmp_path / "hand.json")

@@ -135,6 +135,13 @@ def test_a_camera_info_may_come_late_and_without_one_a_camera_file_serves(tmp_pa
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 40
 
 
+def test_a_camera_of_another_size_is_refused_before_its_lens_is_laid_out(tmp_path: Path) -> None:
+    bent = Camera(CAMERA.K * [[900], [900], [1]], 32 * 900, 24 * 900, (0.1, 0.0, 0.0, 0.0))
+    path = write_bag(tmp_path, "mcap", recording(some_depth(), bent))
+    with pytest.raises(ToftrackError, match="32x24 pixels, but its camera 28800x21600"):
+        read_rosbag(path)
+
+
 def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> None:
     aligned = [
         Message("/camera/aligned/image", IMAGE, image(frame / 2), recorded_ns(n))

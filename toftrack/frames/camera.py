@@ -148,6 +148,8 @@ class Camera:
             if not 0 <= limits[0] < limits[1]:
                 raise ToftrackError("the depth polynomial's range must be nearest, then farthest")
             object.__setattr__(self, "depth_polynomial_range_m", tuple(map(float, limits)))
+        else:
+            object.__setattr__(self, "depth_polynomial_range_m", ())
 
     def _checked_distortion(self) -> np.ndarray:
         if self.lens not in _LENSES:
@@ -212,7 +214,7 @@ class Camera:
 
         Returns a new (H, W) float32, metres. Raises ToftrackError: it is not of the camera's size.
         """
-        self._check_size(depth)
+        self.check_size(depth)
         # A large image takes as long as memory does: nearly all are clean, and as few passes as
         # possible are made over them.
         z = measured = np.ascontiguousarray(depth, np.float32)
@@ -234,7 +236,7 @@ class Camera:
         """
         if amplitude is None:
             return None
-        self._check_size(amplitude)
+        self.check_size(amplitude)
         return self._undistort(amplitude) if self._distorted else amplitude
 
     def project(self, points: np.ndarray) -> np.ndarray:
@@ -342,7 +344,8 @@ class Camera:
     def _undistort(self, image: np.ndarray) -> np.ndarray:
         return cv2.remap(image, self._undistortion_map, None, cv2.INTER_NEAREST, borderValue=0)
 
-    def _check_size(self, image: np.ndarray) -> None:
+    def check_size(self, image: np.ndarray) -> None:
+        """Raise ToftrackError where an image has not the camera's rows and columns."""
         if image.shape != (self.height, self.width):
             raise ToftrackError(
                 f"the image has the shape {image.shape}, but the camera has {self.height} rows and "

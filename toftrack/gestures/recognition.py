@@ -41,6 +41,7 @@ WIDTHS = np.repeat((_THUMB_RAD, FLEXION_RAD, FLEXION_RAD, _SPLIT_RAD, _TIPS_PALM
 """(13,) standard deviations of the features' tails."""
 _DOUBTFUL_SCORE, _SURE_SCORE = 0.5, 0.75
 """A frame of that score, or confidence where that is higher, says nothing; and all it can."""
+_LEAST_WIDTH = 1e-3
 _JOINT = 0.34
 """Probability of being within 40 mm from which a joint is asked, where `joint_ok` wants more;
 higher leaves more gestures unnamed."""
@@ -58,8 +59,10 @@ class GestureSettings:
 
     def __post_init__(self) -> None:
         widths = (self.other,) if self.off_rad is None else (self.other, self.off_rad)
-        if not all(0 < width < math.inf for width in widths):
-            raise ToftrackError("gestures.off_rad and gestures.other must be above 0")
+        if not all(_LEAST_WIDTH <= width < math.inf for width in widths):
+            raise ToftrackError(
+                f"gestures.off_rad and gestures.other must be at least {_LEAST_WIDTH}"
+            )
         if not (0 <= self.smoothing < 1 and 0 <= self.margin < 1):
             raise ToftrackError("gestures.smoothing and gestures.margin must be in 0 .. below 1")
 

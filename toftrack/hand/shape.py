@@ -30,6 +30,8 @@ DEFAULT_HAND_LENGTH_M = 0.190
 
 _FORMAT = "toftrack-hand-shape"
 _VERSION = 2
+_BONE_M = 0.002, 0.25
+"""Bones of a hand are longer, and they and the way from the wrist to a knuckle shorter."""
 
 # Everything below is in millimetres for a hand of 190 mm and scaled from there.
 # Thumb CMC and the four knuckles in the hand frame. The transverse arch of the palm sets the
@@ -203,7 +205,24 @@ class HandShape:
         sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
         if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:
             raise ToftrackError(f"{path} is a damaged hand shape file: sizes {sizes}, {shape.side}")
+        if not shape._sensible:
+            raise ToftrackError(
+                f"{path} is a damaged hand shape file: its numbers make no hand; {remedy}"
+            )
         return shape
+
+    @property
+    def _sensible(self) -> bool:
+        """Whether its numbers can be those of a hand."""
+        shortest, longest = _BONE_M
+        turned = self.base_frames @ self.base_frames.mT - torch.eye(3)
+        return bool(
+            turned.abs().max() < 1e-2
+            and (self.base_m.norm(dim=1) < longest).all()
+            and (self.bone_lengths_m > shortest).all()
+            and (self.bone_lengths_m < longest).all()
+            and 0.2 <= self.thickness <= 5
+        )
 
 
 def _rotation(degrees: float, axis: int) -> Tensor:

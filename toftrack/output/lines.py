@@ -30,6 +30,8 @@ _KINDS: dict[type, type] = {
 }
 _EXACT: dict[str, type] = {"timestamp_s": np.float64, "joint_ok": np.bool_}
 """Fields of another type than their kind's."""
+_LONGEST = 2**24
+"""Bytes of a line: more are what some file systems leave of one when the power is cut."""
 _OF_RUN = ("image_size_px",)
 """What a line says of its frame, and track.npz once."""
 _HINTS = get_type_hints(Estimate)
@@ -105,7 +107,7 @@ def read_lines(path: Path) -> Iterator[dict[str, Any]]:
     Raises ToftrackError when another one is damaged, OSError when the file cannot be read.
     """
     with open_to_read(path) as stream:
-        for number, line in enumerate(stream, 1):
+        for number, line in enumerate(iter(lambda: stream.readline(_LONGEST), b""), 1):
             if not line.endswith(b"\n"):
                 return  # the run was killed, or the machine went down, while it was written
             try:

@@ -226,8 +226,11 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
-        if not isinstance(content["metadata"], dict):
-            raise ValueError("the metadata are no object")
+        about = content["metadata"]
+        parts = [about, *(about.get(name) for name in ("device", "config", "camera"))]
+        parts.append((about.get("config") or {}).get("device"))
+        if not all(isinstance(part, dict | None) for part in parts):
+            raise ValueError("the metadata are no objects")
         content |= facts_for_readers(content["metadata"])
         _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
     except OSError as error:

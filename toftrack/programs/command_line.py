@@ -241,7 +241,7 @@ def _expect(folder: Path, alone: bool = False) -> None:
     alone: it is to have the folder for itself.
     """
     path = folder.absolute()
-    new = tuple(place for place in (path, *path.parents) if not place.exists())
+    new = tuple(place for place in (path, *path.parents) if not os.path.exists(place))
     try:
         with contextlib.suppress(OSError):  # Hydra will say it, too
             if alone and _program.running and (lock := own_folder(path)) is not None:

@@ -228,6 +228,9 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
             "save its depth images under that name"
         )
     images = {name for name in _IMAGES if name in headers}
+    others = sum(headers[name].size for name in headers.keys() & set(_KEYS) - images)
+    if others > MOST_BYTES:
+        raise ValueError(f"beside its images it holds {others / 1e9:.1f} GB")
     if sum(headers[name].size for name in images) <= LOADED_BYTES:
         images.clear()
     return {

@@ -116,7 +116,13 @@ def read_rosbag(
         chosen = _choose(bag, topic)
         camera = _camera(bag, chosen) if camera_file is None else Camera.load(camera_file)
         first = _image(path, chosen, chosen.first, unit_m, 0)
-        check_metres(first, f"the first image of {chosen.name} in '{path}'", _OTHER_UNIT)
+        what = f"the first image of {chosen.name} in '{path}'"
+        check_metres(first, what, _OTHER_UNIT)
+        if first.shape != (camera.height, camera.width):  # its lens would take that much memory
+            raise ToftrackError(
+                f"{what} has {first.shape[1]}x{first.shape[0]} pixels, but its camera"
+                f" {camera.width}x{camera.height}; give the right one with camera.file=FILE"
+            )
         return RosBag(bag, chosen, camera, unit_m)
     finally:
         bag.close()

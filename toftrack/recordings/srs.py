@@ -87,7 +87,7 @@ def _parse_facts(path: Path, text: bytes) -> SrsFacts:
         size = (WIDTH, HEIGHT) if camera is None else (camera.width, camera.height)
         if not sensible or not isinstance(metadata, dict) or size != (WIDTH, HEIGHT):
             raise ValueError
-    except (ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError, ToftrackError):
         raise ToftrackError(f"the TOFT object of the recording '{path}' is damaged") from None
     return SrsFacts(range_m, camera, fps, metadata)
 

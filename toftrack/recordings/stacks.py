@@ -104,7 +104,10 @@ def _reported(path: Path, what: str = "") -> Iterator[None]:
 
 def _npy(path: Path, _: str | None) -> tuple[Any, tuple[int, ...]]:
     with _reported(path):
-        images = np.lib.format.open_memmap(path, mode="r")
+        try:
+            images = np.lib.format.open_memmap(path, mode="r")
+        except ValueError:  # NumPy's words may advise to trust the file
+            raise ValueError("its header is damaged, or it holds Python objects") from None
         stacked = images[None] if images.ndim == 2 else images
         if stacked.flags.c_contiguous:
             return _Npy(path, stacked, images.offset), _PYTHONS

@@ -43,7 +43,7 @@ class PosteriorWeights:
 
     def __post_init__(self) -> None:
         for entry in fields(self):
-            check_number(f"posterior.{entry.name}", getattr(self, entry.name), 0)
+            check_number(f"posterior.{entry.name}", getattr(self, entry.name), 0, 1e6)
 
 
 @dataclass(frozen=True, eq=False)

@@ -330,6 +330,10 @@ class _Connection(ServerConnection):
         if self._unread_bytes > _MOST_UNREAD_BYTES:
             self.transport.abort()
 
+    def send_data(self) -> None:
+        if not self.transport.is_closing():  # asyncio warns of each answer to who is gone
+            super().send_data()
+
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
         self._owner.closed(self)

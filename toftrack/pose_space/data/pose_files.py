@@ -178,7 +178,7 @@ def _read_npz(path: str) -> _Content:
             f"{path}: 'angles' is {angles.dtype} of the shape {angles.shape}; it must be numbers of"
             f" (poses, {len(ANGLE_NAMES)})"
         )
-    names = [str(name) for name in content.get("angle_names", ANGLE_NAMES)]
+    names = [str(name) for name in np.ravel(content.get("angle_names", ANGLE_NAMES))]
     if sorted(names) != sorted(ANGLE_NAMES):
         missing = [name for name in ANGLE_NAMES if name not in names]
         raise ToftrackError(f"{path}: 'angle_names' does not name {missing or 'each angle once'}")
