@@ -331,8 +331,13 @@ class _Connection(ServerConnection):
             self.transport.abort()
 
     def send_data(self) -> None:
-        if not self.transport.is_closing():  # asyncio warns of each answer to who is gone
-            super().send_data()
+        # In one piece: asyncio warns of each one after the first to a client that is gone.
+        pieces = self.protocol.data_to_send()
+        if (data := b"".join(pieces)) and not self.transport.is_closing():
+            self.transport.write(data)
+        if b"" in pieces and self.transport.can_write_eof():
+            with suppress(OSError, RuntimeError):
+                self.transport.write_eof()
 
     def connection_lost(self, exc: Exception | None) -> None:
         super().connection_lost(exc)
