@@ -7,6 +7,6 @@ COPY toftrack /src/toftrack
 COPY conf /src/conf
 RUN pip install --no-cache-dir '/src[figures,export]' && rm -r /src
 WORKDIR /data
-# A first run compiles kernels: now, and they stay in the image.
+# A first run compiles kernels: now, and they stay in the image, for processors like this one's.
 RUN toftrack track device.stop=2 hydra.run.dir=try && rm -r try
 ENTRYPOINT ["toftrack"]

@@ -164,7 +164,14 @@ def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
 ) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setenv("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", str(tmp_path))
-    assert compiling._private_folder() == tmp_path / "toftrack" / "kernels"
+    here = compiling._private_folder()
+    assert here.parent == tmp_path / "toftrack" / "kernels"
+    # Those of another processor, as where a home is shared, are no use, and elsewhere.
+    monkeypatch.setattr(numba.config, "CPU_NAME", "nocona")
+    compiling._machine.cache_clear()
+    other = compiling._private_folder()
+    compiling._machine.cache_clear()
+    assert other.parent == here.parent and other != here
 
 
 def test_what_another_process_is_compiling_is_waited_for() -> None:

@@ -125,6 +125,22 @@ def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:
     assert (config.seed, config.device.seed) == (7, 7)
 
 
+@pytest.mark.parametrize(
+    ("group", "choice"), [("filter", "annealed"), ("segmentation", "nearest"), ("hand", "default")]
+)
+def test_a_choice_beside_an_experiment_keeps_all_of_its_settings(group: str, choice: str) -> None:
+    both = configuration("experiment=paper", f"{group}={choice}")[group]
+    assert both == configuration(f"{group}={choice}")[group]
+
+
+def test_the_paper_s_pose_space_takes_a_file_and_dimensions_of_a_choice(tmp_path: Path) -> None:
+    (tmp_path / "pose_space").mkdir()
+    text = "defaults: [pca]\ndims: 6\nfile: mine.npz\n"
+    (tmp_path / "pose_space" / "mine.yaml").write_text(text)
+    given = [f"hydra.searchpath=[{tmp_path}]", "experiment=paper", "pose_space=mine"]
+    assert configuration(*given).pose_space.dims == 6
+
+
 def test_a_tracker_of_mixed_parts_is_not_built() -> None:
     with pytest.raises(ToftrackError, match="detector=none belongs to experiment=paper"):
         build_tracker(configuration("detector=none"))

@@ -55,6 +55,18 @@ def test_what_is_nowhere_or_behind_the_camera_is_infinitely_far_off(tmp_path) ->
     assert all(row["wrong_pct"] == 100 for row in rows.values())
 
 
+@pytest.mark.parametrize(
+    ("point", "words"),
+    [
+        ({"index_tpi": [50, 40, "visible"]}, "there is no joint 'index_tpi'"),
+        ({"index_tip": [5000, 40, "visible"]}, "the pixel 5000, 40 of a visible index_tip is not"),
+    ],
+)
+def test_a_point_that_cannot_be_is_named(point, words: str, tmp_path) -> None:
+    with pytest.raises(ToftrackError, match=words):
+        points(tmp_path, {"0": {"points": point}})
+
+
 def test_labels_beyond_the_recordings_end_are_refused(tmp_path) -> None:
     seen = points(tmp_path, {"7": {"points": {"thumb_tip": [50, 40, "visible"]}}})
     with pytest.raises(ToftrackError, match="of frame 7, but the recording has 2 frames"):

@@ -322,7 +322,8 @@ def test_what_is_recovered_is_what_the_run_would_have_written(tmp_path: Path) ->
     assert before["joint_names"] == NAMES and before["metadata"] == {"seed": 1}
     for name in ("track.npz", "summary.json"):
         (tmp_path / name).unlink()
-    assert json.dumps(recover(tmp_path)) == json.dumps(summary)  # NaN, too
+    told = summary | {"complete": False}  # nobody knows
+    assert json.dumps(recover(tmp_path)) == json.dumps(told)  # NaN, too
     after = read_results(tmp_path / "track.npz")
     for name in KINDS:
         np.testing.assert_array_equal(after[name], before[name])

@@ -10,7 +10,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from toftrack.compute.compiling import Kernel
+from toftrack.compute.compiling import Kernel, _private_folder
 from toftrack.programs import ahead
 
 
@@ -53,7 +53,7 @@ def test_there_is_none_once_kernels_are_kept_or_on_one_core_or_where_none_can_be
             patch.setattr(place, name, value)
             with ahead.compiling_ahead():
                 assert not helpers
-    (mark.parent / "toftrack" / "kernels" / "one").mkdir()
+    (_private_folder() / "one").mkdir()
     with ahead.compiling_ahead():
         assert not helpers
 

@@ -295,11 +295,15 @@ def test_another_recording_is_refused(run: Path) -> None:
         draw_figures(run, run.parent / "hand.npz")
 
 
-def test_a_run_says_no_code_to_execute(run: Path) -> None:
+def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     spoilt = {"likelihood": {"_target_": "os.system", "command": "true"}}
     change(run / "track.npz", metadata=edited(lambda facts: facts["config"].update(spoilt)))
-    with pytest.raises(ToftrackError, match="likelihood of its own: os.system"):
-        draw_figures(run)
+    names = {path.name for path in draw_figures(run)}
+    assert names >= {"course.png", "latent.png"} and "measurement.png" not in names
+    said = capsys.readouterr().err
+    assert "note: no measurement.png: " in said and "likelihood of its own, os.system, " in said
 
 
 def test_the_command_answers_errors_with_a_sentence(

@@ -50,7 +50,7 @@ def test_jobs_that_differ_only_in_seed_and_recording_are_one_group(sweep: Path) 
     assert pca.error == pytest.approx(13.0) and lle.error == pytest.approx(17.0)
     assert pca.spread == pytest.approx(2**0.5)  # of the seeds' means 12 and 14
     assert (pca.cost_ms, lle.cost_ms) == (20.0, 30.0)
-    assert pca.recordings == pytest.approx({"one": 11.0, "two": 15.0})
+    assert pca.recordings == pytest.approx({"d/one.npz": 11.0, "d/two.npz": 15.0})
 
 
 def test_the_report_writes_a_table_a_csv_and_a_plot(sweep: Path, capsys) -> None:
@@ -63,6 +63,33 @@ def test_the_report_writes_a_table_a_csv_and_a_plot(sweep: Path, capsys) -> None
     assert len(rows) == 8
     assert rows[7]["device.path"] == "d/two.npz" and float(rows[7]["metrics.mean_mm"]) == 20.0
     assert cv2.imread(str(sweep / "sweep.png")).std() > 0
+
+
+def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path: Path, capsys) -> None:
+    for number, folder in enumerate(("mine", "yours")):
+        job(tmp_path, number, [f"device.path=data/{folder}/one.npz"], 10.0 + number)
+    main([str(tmp_path)])
+    text = capsys.readouterr().out
+    assert "mine/one" in text and "yours/one" in text and "data" not in text
+
+
+def test_runs_that_were_interrupted_are_named(sweep: Path, capsys) -> None:
+    path = sweep / "3" / "summary.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"complete": False}))
+    main([str(sweep)])
+    assert "1 of 8 runs were interrupted, and count with" in capsys.readouterr().out
+
+
+def test_a_recording_without_a_pose_in_the_space_compares_all_frames(sweep: Path, capsys) -> None:
+    for number in range(8):
+        path = sweep / str(number) / "summary.json"
+        content = json.loads(path.read_text())
+        content["metrics"]["trust"] = {"mean_all_mm": 30.0}
+        if number == 2:
+            content["metrics"]["mean_mm"] = None
+        path.write_text(json.dumps(content))
+    main([str(sweep)])
+    assert "trust.mean_all_mm" in capsys.readouterr().out
 
 
 def test_jobs_that_failed_are_named_and_left_out_of_the_means(sweep: Path, capsys) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import filelock
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 from llvmlite import ir
@@ -129,7 +130,9 @@ def _cached(function: Callable) -> Any:
 
 
 def _private_folder() -> Path:
-    """The folder of this user's kernels, made if need be. Raises OSError or RuntimeError."""
+    """The folder of this user's kernels for this machine, made if need be. Raises OSError or
+    RuntimeError.
+    """
     given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
     caches = _config.CACHE_DIR or given or Path.home() / ".cache"
     folder = Path(caches).absolute() / "toftrack" / "kernels"
@@ -138,11 +141,21 @@ def _private_folder() -> Path:
     # Windows does not say it so.
     if hasattr(os, "geteuid") and (found.st_uid != os.geteuid() or found.st_mode & 0o077):
         raise PermissionError(f"'{folder}' must belong to this user and be closed to others")
-    return folder
+    of_machine = folder / _machine()
+    of_machine.mkdir(mode=0o700, exist_ok=True)
+    return of_machine
+
+
+@functools.cache
+def _machine() -> str:
+    """What kernels are compiled for and by: a home may be shared, an image run elsewhere."""
+    name = _config.CPU_NAME or llvm.get_host_cpu_name()
+    features = _config.CPU_FEATURES or llvm.get_host_cpu_features().flatten()
+    return hashlib.sha256(f"{numba.__version__} {name} {features}".encode()).hexdigest()[:8]
 
 
 def nothing_kept() -> bool:
-    """Whether this user has never had a kernel compiled, as far as can be seen."""
+    """Whether this user has never had a kernel compiled here, as far as can be seen."""
     try:
         return not any(_private_folder().iterdir())
     except (OSError, RuntimeError):

@@ -101,7 +101,9 @@ def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
     if side not in ("right", "left"):
         raise ValueError(f"the side is {side!r}")
     if "frames" in content:
-        frames = {int(key): _visible(frame["points"]) for key, frame in content["frames"].items()}
+        size = width, height
+        given = content["frames"].items()
+        frames = {int(key): _visible(frame["points"], size) for key, frame in given}
         if not (any(frames.values()) or begun) or min(frames, default=0) < 0:
             raise ValueError("no frame has a visible point")
         if list(content["frames"]) != [str(number) for number in frames]:
@@ -118,16 +120,19 @@ def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
     return Stills(path, (width, height), side, shown, images, called)
 
 
-def _visible(points: Any) -> dict[int, tuple[float, float]]:
+def _visible(points: Any, size: tuple[int, int]) -> dict[int, tuple[float, float]]:
     found = {}
     for name, (u, v, flag) in points.items():
         if flag not in _FLAGS:
             raise ValueError(f"the flag {flag!r} is unknown")
-        row = JOINT_NAMES.index(name)
+        if name not in JOINT_NAMES:
+            raise ValueError(f"there is no joint {name!r}")
         if flag != "absent" and not math.isfinite(u + v):
             raise ValueError(f"the pixel {u}, {v} is none")
         if flag == "visible":
-            found[row] = float(u), float(v)
+            if not (-1 <= u <= size[0] and -1 <= v <= size[1]):
+                raise ValueError(f"the pixel {u}, {v} of a visible {name} is not in the image")
+            found[JOINT_NAMES.index(name)] = float(u), float(v)
     return found
 
 

@@ -76,10 +76,11 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
         files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
         mine = [source for source in (_source(file, known) for file in files) if source]
         if not mine:
+            fit = "that the labels fit" if known else "with truth (an .npz with 'joints_m')"
+            what = "holds no recording" if path.is_dir() else "is no recording"
             raise ToftrackError(
-                f"'{path}' has no {'recording with ' if path.is_dir() else ''}truth (an .npz with "
-                "'joints_m'); give one that has, or labels of its images with --labels FILE, which "
-                "`toftrack label RECORDING` makes"
+                f"'{path}' {what} {fit}; give one that has, or labels of images of its size, and of"
+                " stills of as many, with --labels FILE, which `toftrack label RECORDING` makes"
             )
         found += mine
     for one in known:

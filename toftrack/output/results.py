@@ -67,6 +67,7 @@ class ResultWriter:
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
         self.apparent_m: Sequence[float | None] = ()
         """Of Watch.apparent_m, for summary.json; to be set likewise."""
+        self._complete = True
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -114,7 +115,8 @@ class ResultWriter:
             with closing(self._records or records_of(self.folder, self._facts)) as records:
                 realtime = None if self.realtime is None else self.realtime.summary()
                 self.summary = finish(
-                    self.folder, self._facts, self._truth, records, realtime, self.apparent_m
+                    *(self.folder, self._facts, self._truth, records),
+                    *(self._complete, realtime, self.apparent_m),
                 )
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
@@ -124,7 +126,8 @@ class ResultWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *exception: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._complete = kind is None
         self.close()
 
 
@@ -146,13 +149,15 @@ def finish(
     facts: dict[str, Any],
     truth: Truth | None,
     records: Records,
+    complete: bool,
     realtime: dict[str, Any] | None = None,
     apparent_m: Sequence[float | None] = (),
 ) -> dict[str, Any]:
     """Make track.npz and summary.json of a run's frames; returns the summary. Raises OSError.
 
-    facts: of run.json.  truth: of the run's frames, by their numbers.  realtime: what summary.json
-    says of a live run, and apparent_m, for run_doubts: the lines do not tell either.
+    facts: of run.json.  truth: of the run's frames, by their numbers.  complete: nothing ended the
+    run early.  realtime: what summary.json says of a live run, and apparent_m, for run_doubts: the
+    lines do not tell either.
     """
     metadata = facts["metadata"]
     rows, changed = _every_frame(records)
@@ -164,6 +169,7 @@ def finish(
         "metadata": np.array(json.dumps(metadata)),
     } | facts_for_readers(metadata)
     summary = summarise(records, len(rows), int(dropped.sum()), folder, metadata)
+    summary["complete"] = complete
     summary["doubts"] = run_doubts(records, folder, metadata, apparent_m)
     if realtime is not None:
         summary["realtime"] = realtime

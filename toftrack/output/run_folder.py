@@ -167,7 +167,10 @@ class Run:
         return settings
 
     def _of_its_own(self, what: str, target: object) -> ToftrackError:
-        return ToftrackError(f"the run in '{self.folder}' has a {what} of its own: {target}")
+        return ToftrackError(
+            f"the run in '{self.folder}' has a {what} of its own, {target}, which a run's files may"
+            " not load; what needs none can be read all the same"
+        )
 
     def _made(self, kind: type, group: str) -> Any:
         """Only kinds that are known here: a file must not say what is to be executed."""

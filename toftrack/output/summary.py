@@ -233,7 +233,7 @@ def metrics_line(summary: dict[str, Any]) -> str:
     ]
     if metrics := summary.get("metrics"):
         parts.append(f"usable {text_of(metrics['trust']['usable_pct'])} %")
-        parts.append(f"joint error {text_of(metrics['mean_mm'])} mm")
+        parts.append(f"joint error {text_of(metrics['trust']['mean_mm'])} mm")
     return ", ".join(parts)
 
 

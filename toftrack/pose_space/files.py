@@ -197,7 +197,7 @@ def make_pose_space(
                 f"pose_space.data={data} is unknown; give {' or '.join(_DATA)}, or a file of"
                 " toftrack train for others: pose_space.file=FILE"
             )
-        return fit_pose_space(kind, dims, _DATA[data](), **settings)
+        return fit_pose_space(kind, dims, _DATA[data](), **settings).to("cpu")
     space = load_pose_space(file, kind)
     wanted = kind_of_space(kind)[0].kind
     if space.kind != wanted or space.dims != dims:

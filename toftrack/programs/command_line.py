@@ -211,7 +211,7 @@ class FailedJobs(Callback):
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = _given(config, "sweep")
-        _expect(folder)
+        _expect(folder, alone=True)
         for job in folder.iterdir() if folder.is_dir() else ():
             let_links_go(job)
             _let_links_go(job)

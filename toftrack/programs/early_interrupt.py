@@ -8,6 +8,7 @@ is done Ctrl-C does nothing any more: its status is known.
 """
 
 import atexit
+import io
 import os
 import signal
 import sys
@@ -22,6 +23,10 @@ def _end(number: int, frame: FrameType | None) -> None:
 for stream in (sys.stdin, sys.stdout, sys.stderr):
     if stream is None:  # closed: else the next file that is opened takes its descriptor
         os.open(os.devnull, os.O_RDWR)
+for stream in (sys.stdout, sys.stderr):
+    # A file's name may have what an encoding lacks.
+    if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+        stream.reconfigure(errors="backslashreplace")
 if sys.stderr is None:  # what is said there is for nobody, and must not come out elsewhere
     sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # until the end
 

@@ -89,11 +89,19 @@ def draw_figures(
     ):
         # The folder within the run's must be no link; which one --out is, the user says.
         make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
-        written = []
+        written, missing = [], None
         for name in tqdm(figures, unit=" figures", file=sys.stderr, delay=1.0, leave=False):
+            try:
+                picture = figures[name]()
+            except ToftrackError as error:  # as of a run whose pose space is of its user's own
+                missing = error
+                print(f"note: no {name}.png: {error}", file=sys.stderr)
+                continue
             path = target / f"{name}.png"
-            write_picture(path, figures[name]())
+            write_picture(path, picture)
             written.append(path)
+        if missing and not written:
+            raise missing
     return written
 
 

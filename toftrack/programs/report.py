@@ -25,8 +25,12 @@ from toftrack.files.safe_files import open_to_read, write_whole
 from toftrack.programs.command_line import Parser
 from toftrack.views.figures import chart
 
-_FIGURES = ("metrics.mean_mm", "mean_score", "reached_degrees", "training_degrees")
-"""What to compare by: joint error, score without truth; of train_pose_space.py, degrees."""
+_FIGURES = (
+    *("metrics.mean_mm", "metrics.trust.mean_all_mm", "mean_score"),
+    *("reached_degrees", "training_degrees"),
+)
+"""What to compare by: joint error of the frames in the pose space, or of all, where a recording has
+none in it; score without truth; of train_pose_space.py, degrees."""
 
 _SEED = "seed"
 _RECORDING = "device.path"
@@ -44,6 +48,8 @@ class Run:
     """Numbers of summary.json, nested names joined by dots."""
     error: str | None = None
     """Why it failed."""
+    complete: bool = True
+    """Nothing ended it early."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +105,9 @@ def _read_run(path: Path, folder: Path) -> Run:
     if not isinstance(summary, dict):
         return Run(name, overrides, {}, "its summary.json is not one of track.py")
     told = summary.get("error")
-    return Run(name, overrides, _flat(summary), None if told is None else _printable(str(told)))
+    complete = summary.get("complete") is not False
+    failed = None if told is None else _printable(str(told))
+    return Run(name, overrides, _flat(summary), failed, complete)
 
 
 def _printable(text: str) -> str:
@@ -158,12 +166,20 @@ def _group(settings: str, runs: list[Run], figure: str) -> Group:
 
 
 def _parts(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
-    """The runs by an override, of a recording by its name; sorted."""
+    """The runs by an override; sorted."""
     parts: dict[str, list[Run]] = {}
     for run in runs:
-        value = run.overrides.get(key, "")
-        parts.setdefault(Path(value).stem if key == _RECORDING else value, []).append(run)
+        parts.setdefault(run.overrides.get(key, ""), []).append(run)
     return dict(sorted(parts.items()))
+
+
+def _short_names(paths: Sequence[str]) -> list[str]:
+    """Recordings as a table tells them apart: without what all folders share, and endings."""
+    names = [(*Path(path).parent.parts, Path(path).stem) for path in paths]
+    shared = 0
+    while all(len(name) > shared + 1 and name[shared] == names[0][shared] for name in names):
+        shared += 1
+    return ["/".join(name[shared:]) for name in names]
 
 
 def _mean(runs: Sequence[Run], name: str) -> float:
@@ -186,24 +202,31 @@ def _write_csv(runs: Sequence[Run], path: Path) -> None:
 
 def _table(groups: Sequence[Group], figure: str) -> str:
     """The groups as text for the terminal; a second block by recording where there are several."""
-    unit, digits = ("mm", 2) if figure.endswith("_mm") else (figure.removeprefix("metrics."), 3)
-    lines = [f" #  runs failed  {unit:>10}   spread    ms/frame  settings"]
+    digits, column = 2 if figure.endswith("_mm") else 3, figure.removeprefix("metrics.")
+    wide = max(10, len(column))
+    lines = [f" #  runs failed  {column:>{wide}}   spread    ms/frame  settings"]
     for number, group in enumerate(groups, 1):
         failed = sum(run.error is not None for run in group.runs)
         lines.append(
-            f"{number:2d} {len(group.runs):5d} {failed:6d}  {_text(group.error, digits):>10}"
+            f"{number:2d} {len(group.runs):5d} {failed:6d}  {_text(group.error, digits):>{wide}}"
             f" {_text(group.spread, digits):>8}  {_text(group.cost_ms, 1):>10}  {group.settings}"
         )
     names = list(dict.fromkeys(name for group in groups for name in group.recordings))
     if len(names) > 1:
-        width = max(8, *(len(name) for name in names))
-        lines += ["", " #  " + " ".join(f"{name:>{width}}" for name in names)]
+        short = _short_names(names)
+        width = max(8, *map(len, short))
+        lines += ["", " #  " + " ".join(f"{name:>{width}}" for name in short)]
         for number, group in enumerate(groups, 1):
             cells = [_text(group.recordings.get(name), digits) for name in names]
             lines.append(f"{number:2d}  " + " ".join(f"{cell:>{width}}" for cell in cells))
     done = [run for group in groups for run in group.runs if run.error is None]
     if without := sum(figure not in run.figures for run in done):
         lines.append(f"{without} of {len(done)} runs have no {figure}; the means are without them")
+    if early := [run.name for run in done if not run.complete]:
+        lines.append(
+            f"{len(early)} of {len(done)} runs were interrupted, and count with the frames they"
+            f" have: {', '.join(early)}"
+        )
     return "\n".join(lines)
 
 
@@ -251,11 +274,20 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
-    about = "Gather the jobs of a sweep, or whatever runs are below a folder, into one table."
+    about = (
+        "Gather the jobs of a sweep, or whatever runs are below a folder, into one table: for each"
+        " choice of settings the mean over its runs of a figure, its standard deviation over seeds"
+        " (spread), and the median time of a frame. `toftrack benchmark accuracy --compare` tells"
+        " settings apart with intervals."
+    )
     parser = Parser(prog="toftrack report", description=about)
     about = "the sweep's, multirun/DATE/TIME; to compare two runs, one into which you moved both"
     parser.add_argument("folder", nargs="+", help=about)
-    about = "of summary.json, as metrics.fingertip_mm; default the mean joint error"
+    about = (
+        "of summary.json, as metrics.fingertip_mm; default metrics.mean_mm, the mean joint error of"
+        " frames in the pose space from the sixth on, or metrics.trust.mean_all_mm, of all frames,"
+        " where a recording has none of these"
+    )
     parser.add_argument("--figure", help=about)
     given = parser.parse_args(arguments)
     if len(given.folder) > 1:

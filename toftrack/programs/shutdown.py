@@ -112,7 +112,7 @@ def forget_streams() -> None:
 
     Python would complain at its exit about what it could not write, with a status of its own.
     """
-    for stream in (sys.stdout, sys.stderr):
+    for stream in filter(None, (sys.stdout, sys.stderr)):  # None was closed from the start
         try:
             stream.flush()
         except (OSError, ValueError):

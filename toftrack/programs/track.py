@@ -50,7 +50,8 @@ _SHAPES_APART_S = 1.0
 
 
 def track(config: DictConfig, device: Device) -> float:
-    """Run a configuration to its end; returns the mean joint error in mm, else 1 - mean score.
+    """Run a configuration to its end; returns the mean joint error in mm, of the frames in
+    the pose space or, where there is none, of all, else 1 - mean score.
 
     `device` is what `config.device` describes; it is opened and closed here. A request to end the
     program is obeyed between two frames; then everything is finished before it is passed on.
@@ -130,7 +131,8 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
         raise ended
     if not summary.get("frames"):
         raise ToftrackError("the device delivered no frame; nothing was tracked")
-    error = (summary.get("metrics") or {}).get("mean_mm")
+    metrics = summary.get("metrics") or {}
+    error = metrics.get("mean_mm") or (metrics.get("trust") or {}).get("mean_all_mm")
     return float(error) if error is not None else 1.0 - float(summary["mean_score"] or 0.0)
 
 

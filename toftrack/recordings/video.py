@@ -149,8 +149,10 @@ def _opened(path: Path) -> Any:
 
     remedy = "it is damaged, cut off or of another kind"
     with reported_errors(f"'{path}' cannot be read as a video", remedy, *_errors()):
-        # A damaged text among the tags is no reason to refuse the images.
-        return av.open(str(path), metadata_errors="replace", options=_ONLY_THIS_FILE)
+        # A damaged text among the tags is no reason to refuse the images, which older ones do.
+        old = int(av.__version__.partition(".")[0]) < 19
+        more = {"metadata_errors": "replace"} if old else {}
+        return av.open(str(path), options=_ONLY_THIS_FILE, **more)
 
 
 def _errors() -> tuple[type[Exception], ...]:
