@@ -258,13 +258,16 @@ def test_on_the_arm_of_a_hand_that_is_seen_no_track_begins(
         assert len(state.tracks) == (2 if begins and frame == 2 else 1)
 
 
-def left_of(seen: Detection | None, dt_s: float = FRAME_S) -> set[torch.Tensor]:
+def left_of(
+    seen: Detection | None, dt_s: float = FRAME_S, reliable: bool = True
+) -> set[torch.Tensor]:
     """Of hands about the one that the pose network sees, those that are none of its arm."""
     others = {pose: detection_of(pose, side="left") for pose in EVERYTHING}
     model = replace(any_hand_model(), detector=FixedDetector(list(others.values())))
     depth = IMAGE.depth_m.copy()
     depth[105:112, 90:150] = 0.5  # a forearm to the right
-    state = state_of(known(), model=model, places=places_of(*others.values()))
+    track = replace(known(), confirmed=reliable)
+    state = state_of(track, model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
     at_tracks = [] if seen is None else [lambda: SideDetection(seen, "right", 0)]
     asked = PendingDetections(at_tracks, False, no_places, False)
@@ -286,6 +289,13 @@ def test_what_nobody_looks_at_has_its_predicted_arm_and_what_is_hardly_a_hand_no
     assert left_of(None) == {BESIDE, ACROSS, BELOW}
     assert left_of(replace(FOUND[0], present=1e-4)) == EVERYTHING
     assert left_of(FOUND[0], dt_s=0.2) == EVERYTHING, "it was seen long ago"
+
+
+def test_what_may_itself_be_an_arm_takes_no_better_hand_for_its_own() -> None:
+    """An elbow that was found while something hid the hand keeps it from being found again."""
+    seen = replace(FOUND[0], present=0.9)
+    assert left_of(seen, reliable=True) == {BESIDE, ACROSS, BELOW}
+    assert left_of(seen, reliable=False) == EVERYTHING
 
 
 # Which one is meant.

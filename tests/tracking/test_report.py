@@ -146,6 +146,18 @@ def test_four_hands_of_any_sides_each_have_a_slot_and_keep_it() -> None:
     assert numbers(state, tracks[0], tracks[2], tracks[3], hand(4)) == [0, 4, 2, 3]
 
 
+@pytest.mark.parametrize("hands", [1, 2, 4])
+def test_a_hand_of_which_a_frame_shows_nothing_keeps_its_slot(hands: int) -> None:
+    tracks = [hand(at, side) for at, side in enumerate(("right", "left", "right", "left"))][:hands]
+    state, _ = reported(before(hands), *tracks)
+    scene = scene_of(*tracks, image=IMAGE, model=any_hand_model())
+    blank, _, estimates = report(state, [], scene, Spans())
+    assert all(one.lost for one in estimates)
+    assert [slot.track for slot in blank.slots] == [slot.track for slot in state.slots]
+    gone, *_ = report(replace(state, tracks=()), [], scene, Spans())
+    assert {slot.track for slot in gone.slots} == {-1}
+
+
 def test_of_more_hands_than_slots_the_first_ones_are_reported() -> None:
     assert numbers(before(2), hand(0), hand(1, "left"), hand(2)) == [0, 1]
 
@@ -185,6 +197,15 @@ def test_where_no_side_was_said_a_wrong_one_makes_the_estimate_wrong(side: str) 
     assert estimate.side_probability == pytest.approx(sure, abs=0.01)
     assert estimate.confidence == pytest.approx(0.9 * estimate.side_probability)
     assert side.endswith(estimate.side) and not estimate.lost
+
+
+def test_an_estimate_whose_side_makes_it_improbable_is_lost() -> None:
+    one = followed(hand(0, "perhaps right"))
+    doubtful = replace(one, status=replace(one.status, confidence=0.3))
+    state = replace(before(), tracks=(one.track,))
+    scene = scene_of(one.track, image=IMAGE, model=any_hand_model())
+    _, _, (estimate,) = report(state, [doubtful], scene, Spans())
+    assert estimate.lost and estimate.confidence < 0.2 and not estimate.joint_ok.any()
 
 
 def test_the_only_hand_that_was_lost_is_reported_where_it_was_last_believed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -88,7 +89,11 @@ def finish_detection(
     places = _apart_from(believed, places)
     found = _elsewhere(scene, state, places, rare) if len(places.centre_m) else []
     arms = _arms(scene, seen) if found and not rare else []
-    return seen + [one for one in found if not any(_is_on(arm, one.detection) for arm in arms)]
+    return seen + [
+        one
+        for one in found
+        if not any(one.detection.merit <= most and _is_on(arm, one.detection) for arm, most in arms)
+    ]
 
 
 def rests(scene: Scene, row: int, state: TrackerState) -> bool:
@@ -158,19 +163,23 @@ def _elsewhere(
     return seen if tracks or state.told else held_out_first(seen)
 
 
-def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[Arm]:
+def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]]:
     """The arms of detected hands, but for those of low merit, and of reliable tracks that nobody
-    looked at.
+    looked at; and the merit up to which a detection there is the arm: of a track that is not
+    reliable its own, for that may be the arm, and the detection its hand.
     """
-    least = scene.model.detector.settings.merit
-    detections = [one.detection for one in seen]
-    arms = [scene.arm(one) for one in detections if merit(one, one.heat) >= least]
+    arms = []
+    for one in seen:
+        own = merit(one.detection, one.detection.heat)
+        if own >= scene.model.detector.settings.merit:
+            reliable = scene.hands[one.row].track.reliable
+            arms.append((scene.arm(one.detection), math.inf if reliable else own))
     looked = {one.row for one in seen}
-    return arms + [
-        (hand.joints_m[0].numpy(), -hand.up_m[0] / max(float(np.linalg.norm(hand.up_m[0])), 1e-6))
-        for row, hand in enumerate(scene.hands)
-        if row not in looked and hand.track.reliable
-    ]
+    for row, hand in enumerate(scene.hands):
+        if row not in looked and hand.track.reliable:
+            along = -hand.up_m[0] / max(float(np.linalg.norm(hand.up_m[0])), 1e-6)
+            arms.append(((hand.joints_m[0].numpy(), along), math.inf))
+    return arms
 
 
 def _is_on(arm: Arm, detection: Detection) -> bool:

@@ -73,10 +73,14 @@ def report(
     state: with the tracks that go on.  results: also of those that ended in this frame.
     """
     rights = [side_log_odds(one.track, state.tracks, state.told) for one in results]
+    # Tracks that this frame shows nothing of keep their slots, as they go on.
+    unseen = {track.number for track in state.tracks} - {one.track.number for one in results}
     slots, infos, estimates = [], list[StepInfo | None](), []
     for number, row in enumerate(assign_slots(state, results, rights)):
         slot, info = state.slots[number], None
         if row is None:
+            if slot.track not in unseen:
+                slot = changed(slot, track=-1)
             slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
         else:
             each = results[row], rights[row]
@@ -148,6 +152,8 @@ def report_track(
     rows = joint_features(estimate.joints_m, *seen, image.depth_m, image.k)
     sigma, confidence = model.lost.joints.judge(rows)
     estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
+    if estimate.confidence < model.lost.confidence and not estimate.lost:  # by its side
+        estimate = estimate.updated(lost=True, state_name="searching")
     estimate = estimate.updated(
         joint_sigma_m=sigma,
         joint_confidence=confidence,
@@ -199,15 +205,15 @@ def with_side(estimate: Estimate, side: str, right: float, wanted: str | None) -
 def report_absence(
     slot: Slot, image: DepthImage, model: FilterModel, count: int
 ) -> tuple[Slot, Estimate]:
-    """A slot without track, and a lost estimate: NaN, or of the only slot its last one."""
+    """A slot without result, and a lost estimate: NaN, or of the only slot its last one."""
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
-        return changed(slot, track=-1, gesture=None), nothing
+        return changed(slot, gesture=None), nothing
     estimate = lost_estimate(slot.last, image.index, image.timestamp_s, math.nan)
     height, width = image.depth_m.shape
     estimate = with_landmarks(estimate, image.k, (width, height))
     gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
-    return changed(slot, track=-1, gesture=gesture), estimate
+    return changed(slot, gesture=gesture), estimate
 
 
 def make_estimate(
