@@ -76,11 +76,15 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
         files = sorted(path.glob("*.npz")) if path.is_dir() else [path]
         mine = [source for source in (_source(file, known) for file in files) if source]
         if not mine:
-            fit = "that the labels fit" if known else "with truth (an .npz with 'joints_m')"
-            what = "holds no recording" if path.is_dir() else "is no recording"
+            what = f"'{path}' {'holds no recording' if path.is_dir() else 'is no recording'}"
+            if known:
+                raise ToftrackError(
+                    f"{what} that the labels fit, by the images' size and, of stills, their number;"
+                    " give the one that was labelled"
+                )
             raise ToftrackError(
-                f"'{path}' {what} {fit}; give one that has, or labels of images of its size, and of"
-                " stills of as many, with --labels FILE, which `toftrack label RECORDING` makes"
+                f"{what} with truth (an .npz with 'joints_m'); give one that has, or labels of its "
+                "images with --labels FILE, which `toftrack label RECORDING` makes"
             )
         found += mine
     for one in known:
