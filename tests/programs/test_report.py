@@ -66,11 +66,13 @@ def test_the_report_writes_a_table_a_csv_and_a_plot(sweep: Path, capsys) -> None
 
 
 def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path: Path, capsys) -> None:
-    for number, folder in enumerate(("mine", "yours")):
-        job(tmp_path, number, [f"device.path=data/{folder}/one.npz"], 10.0 + number)
+    paths = ("mine/one.npz", "yours/one.npz", "yours/one.srs", "./mine/../mine/one.npz")
+    for number, path in enumerate(paths):
+        job(tmp_path, number, [f"device.path=data/{path}"], 10.0 + number)
     main([str(tmp_path)])
     text = capsys.readouterr().out
-    assert "mine/one" in text and "yours/one" in text and "data" not in text
+    assert text.count("mine/one") == 1 and "yours/one.npz" in text and "yours/one.srs" in text
+    assert "data" not in text
 
 
 def test_runs_that_were_interrupted_are_named(sweep: Path, capsys) -> None:

@@ -136,7 +136,8 @@ def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
     assert 3 <= len(done) < 100
     result = read_results(tmp_path / "out" / "track.npz")
     assert len(result["joints_m"]) == len(done)
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["frames"] == len(done)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["frames"] == len(done) and summary["complete"] is False
     assert len(video_frames(tmp_path / "out" / "overlay.mp4")) == len(done)
     assert HandShape.load(tmp_path / "out" / "hand_shape.json").side == "right"
 

@@ -130,7 +130,7 @@ def _one_writer(folder: Path) -> Iterator[None]:
     except BlockingIOError:
         raise ToftrackError(
             f"another run is writing into the folder '{folder}' just now; wait for its end, or "
-            "choose another folder with hydra.run.dir=DIR"
+            "choose another folder with hydra.run.dir=DIR, or of a sweep hydra.sweep.dir=DIR"
         ) from None
 
 

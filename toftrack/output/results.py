@@ -67,7 +67,8 @@ class ResultWriter:
         """How a live run kept up, for summary.json; to be set before the writer is closed."""
         self.apparent_m: Sequence[float | None] = ()
         """Of Watch.apparent_m, for summary.json; to be set likewise."""
-        self._complete = True
+        self.complete = True
+        """Whether nothing ended the run early; likewise."""
         self._truth = truth
         self._facts = {
             "format": RUN_FORMAT,
@@ -116,7 +117,7 @@ class ResultWriter:
                 realtime = None if self.realtime is None else self.realtime.summary()
                 self.summary = finish(
                     *(self.folder, self._facts, self._truth, records),
-                    *(self._complete, realtime, self.apparent_m),
+                    *(self.complete, realtime, self.apparent_m),
                 )
         except OSError as error:
             raise _unwritable(self.folder, error, self.frames) from error
@@ -127,7 +128,7 @@ class ResultWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._complete = kind is None
+        self.complete = self.complete and kind is None
         self.close()
 
 

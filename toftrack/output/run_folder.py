@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from toftrack.devices.synthetic import Synthetic
-from toftrack.errors import ToftrackError, check_number, reported_errors
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate
@@ -33,8 +33,8 @@ from toftrack.render.segmentation import Expected, NearestSurface, Observation
 FILES = ("track.npz", "track.jsonl", "summary.json", "hand_shape.json")
 """What a folder must hold to be a run's."""
 
-_MOST_SYNTHETIC = 10_000
-"""Frames of `device=synthetic` that are made again: a gigabyte."""
+_MOST_SYNTHETIC = 20_000
+"""Frames of `device=synthetic` that are made again: 3 GB."""
 _SAME_TIME_S = 0.002
 
 
@@ -325,7 +325,11 @@ def _rows(
 
 def _synthetic(device: dict[str, Any]) -> Recording:
     """The frames that `device=synthetic` made, made again."""
-    check_number("device.frames of the run", device.get("frames", 1), 1, _MOST_SYNTHETIC)
+    if not (isinstance(device.get("frames"), int) and 1 <= device["frames"] <= _MOST_SYNTHETIC):
+        raise ToftrackError(
+            f"the run's synthetic frames cannot be made again: {device.get('frames')} are none, or"
+            f" more than {_MOST_SYNTHETIC}; keep them next time, with record=FILE"
+        )
     made = Synthetic(**{key: value for key, value in device.items() if key != "_target_"})
     frames = list(made)
     return Recording(

@@ -212,7 +212,7 @@ class FailedJobs(Callback):
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = _given(config, "sweep")
         _expect(folder, alone=True)
-        for job in folder.iterdir() if folder.is_dir() else ():
+        for job in folder.iterdir() if os.path.isdir(folder) else ():
             let_links_go(job)
             _let_links_go(job)
         self._before = {path: path.stat().st_mtime_ns for path in _summaries(config)}
@@ -248,9 +248,10 @@ def _expect(folder: Path, alone: bool = False) -> None:
                 _program.locks.append(lock)
     except ToftrackError as error:
         raise _JobFailedError(error) from error
-    _let_links_go(folder)
-    if not path.exists() or path.is_dir() and not any(path.iterdir()):
-        _new_folders.setdefault(path, new)
+    with contextlib.suppress(OSError):  # likewise
+        _let_links_go(folder)
+        if not path.exists() or path.is_dir() and not any(path.iterdir()):
+            _new_folders.setdefault(path, new)
 
 
 def _let_links_go(folder: Path) -> None:

@@ -24,8 +24,10 @@ for stream in (sys.stdin, sys.stdout, sys.stderr):
     if stream is None:  # closed: else the next file that is opened takes its descriptor
         os.open(os.devnull, os.O_RDWR)
 for stream in (sys.stdout, sys.stderr):
-    # A file's name may have what an encoding lacks.
-    if isinstance(stream, io.TextIOWrapper) and stream.errors == "strict":
+    # A file's name may have what an encoding lacks; what is no text in it passes through UTF-8.
+    if isinstance(stream, io.TextIOWrapper) and (
+        stream.errors == "strict" or stream.encoding.lower() not in ("utf-8", "utf8")
+    ):
         stream.reconfigure(errors="backslashreplace")
 if sys.stderr is None:  # what is said there is for nobody, and must not come out elsewhere
     sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # until the end

@@ -75,7 +75,8 @@ def recover(
                 cut_to_whole(folder / VIDEO)
             remove_partial(folder, WHOLE_FILES)
             truth = _truth(facts, recording)
-            complete = earlier.get("complete") is True
+            whole = earlier.get("frames") == count_frames(records)
+            complete = whole and earlier.get("complete") is True
             return finish(folder, facts, truth, records, complete, earlier.get("realtime"))
     except FileNotFoundError:
         raise ToftrackError(f"'{folder}' has no {LINES}, so there is nothing to recover") from None

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -169,7 +170,9 @@ def _parts(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
     """The runs by an override; sorted."""
     parts: dict[str, list[Run]] = {}
     for run in runs:
-        parts.setdefault(run.overrides.get(key, ""), []).append(run)
+        value = run.overrides.get(key, "")
+        value = os.path.normpath(value) if key == _RECORDING and value else value
+        parts.setdefault(value, []).append(run)
     return dict(sorted(parts.items()))
 
 
@@ -179,7 +182,11 @@ def _short_names(paths: Sequence[str]) -> list[str]:
     shared = 0
     while all(len(name) > shared + 1 and name[shared] == names[0][shared] for name in names):
         shared += 1
-    return ["/".join(name[shared:]) for name in names]
+    short = ["/".join(name[shared:]).replace("//", "/") for name in names]
+    return [
+        name + Path(path).suffix if short.count(name) > 1 else name
+        for name, path in zip(short, paths, strict=True)
+    ]
 
 
 def _mean(runs: Sequence[Run], name: str) -> float:

@@ -183,6 +183,7 @@ class Run:
         )
         if in_sweep():  # gone afterwards, and none at all where nobody looks
             progress = partial(progress, leave=False, disable=None)
+        results.complete = False
         try:
             with progress() as bar, logging_redirect_tqdm():  # above the bar, on lines of their own
                 for frame in frames_of(self.device):
@@ -191,6 +192,7 @@ class Run:
                         tracked, _ = self.frame(frame, began_s, view, keep)
                         bar.update()
                         bar.set_postfix_str(self._progress(tracked.estimates), refresh=False)
+            results.complete = True
         except ReaderGoneError as gone:
             print(f"{gone}: tracking ends here", file=sys.stderr)
         finally:
