@@ -42,6 +42,7 @@ WIDTHS = np.repeat((_THUMB_RAD, FLEXION_RAD, FLEXION_RAD, _SPLIT_RAD, _TIPS_PALM
 _DOUBTFUL_SCORE, _SURE_SCORE = 0.5, 0.75
 """A frame of that score, or confidence where that is higher, says nothing; and all it can."""
 _LEAST_WIDTH = 1e-3
+"""Of the pose space's term and of the weight of "other": squares of less overflow."""
 _JOINT = 0.34
 """Probability of being within 40 mm from which a joint is asked, where `joint_ok` wants more;
 higher leaves more gestures unnamed."""
