@@ -106,7 +106,7 @@ def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> Non
     before = default_hand_shape().scaled(math.exp(0.05)).bone_lengths_m.sum(1)
     assert off.square().mean() < 0.6 * (before / shape.bone_lengths_m.sum(1)).log().square().mean()
     sigma = belief.summary().sigma
-    assert sigma[0] < 0.3 * POPULATION_SIGMA[0]
+    assert sigma[0] < 0.5 * POPULATION_SIGMA[0]  # what is alike in all frames stays
     assert sigma[3] == pytest.approx(POPULATION_SIGMA[3], rel=1e-3)  # joints tell no thickness
 
 
