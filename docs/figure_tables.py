@@ -89,52 +89,52 @@ def _readme(rows: Rows) -> list[str]:
     return [
         "| | toftrack | MediaPipe Hands |",
         "| --- | --- | --- |",
-        "| **real, put away until the end: Senz3D on the head**, 1015 frames of three motions of"
-        " one hand: every joint within 40 mm, and not flagged |"
+        "| **real, held out until the end: Senz3D on the head**, 1015 frames of three motions of"
+        " one hand: usable |"
         f" {one('away', 'usable_pct', '%')} |",
-        f"| ... wrong as a whole, and not flagged | {one('away', 'silent_pct', '%', 1)} |",
-        "| ... of the frames that are not flagged: all visible fingertips within 40 mm |"
+        f"| ... silently wrong | {one('away', 'silent_pct', '%', 1)} |",
+        "| ... all visible fingertips within 40 mm, of the frames not flagged |"
         f" {one('away', 'tips_40_pct', '%')} |",
-        "| ... a visible fingertip is farther off, and neither it nor the frame is flagged |"
+        "| ... a visible fingertip farther off, neither it nor the frame flagged |"
         f" {one('away', 'tips_wrong_ok_pct', '%', 1)} |",
-        "| **real, nothing chosen on it: Kinect V2**, 25 frames: all visible fingertips within"
+        "| **real, no setting chosen on it: Kinect V2**, 25 frames: all visible fingertips within"
         f" 40 mm | {one('kinect2, kept back', 'tips_40_pct', '%')} |",
-        "| ... a fingertip is farther off, and not flagged |"
+        "| ... a fingertip farther off, not flagged |"
         f" {one('kinect2, kept back', 'wrong_pct', '%')} |",
-        "| **real, on which settings were chosen**: 27 other frames of the Kinect, all visible"
+        "| **real, settings chosen on it**: 27 other frames of the Kinect: all visible"
         f" fingertips within 40 mm | {one('kinect2', 'tips_40_pct', '%')} |",
-        "| ... 165 single images of eleven gestures, Senz3D: the hand is found |"
+        "| ... 165 single images of eleven gestures, Senz3D: hand found |"
         f" {one('stills', 'found_pct', '%')} |",
-        f"| ... and its gesture is named rightly | {one('stills', 'named_pct', '%')} |",
-        "| ... 1151 frames of three other motions, Senz3D on the head: every joint within 40 mm,"
-        f" and not flagged | {one('at hand', 'usable_pct', '%')} |",
-        "| ... a hand with a thing, SR300 on the head, 84 frames, in all of which the pose is"
-        f" wrong: flagged | {one('at hand', 'thing_flagged_pct', '%')} |",
-        "| **12 drawn persons** on whom nothing was tuned: every joint within 40 mm, and not"
-        f" flagged | {both(bare, 'usable_pct', '%')} |",
-        f"| ... wrong as a whole, and not flagged | {both(bare, 'silent_pct', '%', 1)} |",
-        "| ... mean joint error, all frames in which the hand is visible |"
+        f"| ... and its gesture named correctly | {one('stills', 'named_pct', '%')} |",
+        "| ... 1151 frames of three other motions, Senz3D on the head: usable |"
+        f" {one('at hand', 'usable_pct', '%')} |",
+        "| ... a hand with an object, SR300 on the head, 84 frames, nearly all with a wrong pose:"
+        f" flagged | {one('at hand', 'thing_flagged_pct', '%')} |",
+        "| **12 rendered persons**, no setting chosen on them: usable |"
+        f" {both(bare, 'usable_pct', '%')} |",
+        f"| ... silently wrong | {both(bare, 'silent_pct', '%', 1)} |",
+        "| ... mean joint error, all frames with a visible hand |"
         f" {both(bare, 'mean_all_mm', 'mm', 1)} |",
-        "| **4 more, three of whom hold things**: every joint within 40 mm, and not flagged |"
+        "| **4 more, of whom three hold objects**: usable |"
         f" {both(others, 'usable_pct', '%')} |",
-        "| **drawn rooms, and persons who raise no hand**: frames that are called a hand |"
+        "| **rendered rooms, and persons who raise no hand**: reported as a hand |"
         f" {one('empty', 'silent_pct', '%', 1)} |",
-        "| **17 real rooms without a hand**, 1175 images, of which 292 were looked at for one"
-        " choice: called one |"
+        "| **17 real rooms without a hand**, 1175 images (292 used for one choice):"
+        " reported as a hand |"
         f" {one('rooms', 'called_pct', '%', 1)} |",
-        "| **time** of a frame of the packaged sample, in turn; MediaPipe looks for one hand |"
+        "| **time per frame**, packaged sample, programs in turn; MediaPipe looks for one hand |"
         f" {both('in turn', 'median_ms', 'ms', 1)} |",
     ]
 
 
 _SETS = {
     "strangers, bare": "strangers, 12 with bare hands",
-    "strangers, others": "strangers, 4 that hold things or are seen from the head",
-    "crowd": "crowd (settings were chosen on it)",
+    "strangers, others": "strangers, 4 that hold objects or are seen from the head",
+    "crowd": "crowd (settings chosen on it)",
     "grasps": "grasps",
-    "mesh-hand": "mesh-hand (side not told)",
+    "mesh-hand": "mesh-hand (side not given)",
     "guards": "guards",
-    "sample": "the packaged sample (side not told)",
+    "sample": "the packaged sample (side not given)",
 }
 
 
@@ -181,14 +181,14 @@ def _images(rows: Rows) -> list[str]:
     return [
         "| | toftrack | commit |",
         "| --- | --- | --- |",
-        "| Kinect V2, 27 labelled frames, with which weights and thresholds were chosen | | |",
+        "| Kinect V2, 27 labelled frames; weights and thresholds chosen on them | | |",
         *kinect("kinect2"),
         line("... fingertips, median", "kinect2", "tips_median_mm", "mm", 1),
         line("... fingertips, mean", "kinect2", "tips_mean_mm", "mm", 1),
-        "| Kinect V2, 25 other frames of the same recording | | |",
+        "| Kinect V2, 25 other frames of the same recording, held out | | |",
         *kinect("kinect2, kept back"),
         line("stills: found", "stills", "found_pct", "%"),
-        line("... named rightly, of all images", "stills", "named_pct", "%"),
+        line("... named correctly, of all images", "stills", "named_pct", "%"),
         line("... given the name of another gesture", "stills", "wrong_name_pct", "%"),
         line("no raised hand: frames called a hand", "empty", "silent_pct", "%", 1),
     ]
