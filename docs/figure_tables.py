@@ -115,8 +115,7 @@ def _readme(rows: Rows) -> list[str]:
         f"| ... silently wrong | {both(bare, 'silent_pct', '%', 1)} |",
         "| ... mean joint error, all frames with a visible hand |"
         f" {both(bare, 'mean_all_mm', 'mm', 1)} |",
-        "| **4 more, of whom three hold objects**: usable |"
-        f" {both(others, 'usable_pct', '%')} |",
+        f"| **4 more, of whom three hold objects**: usable | {both(others, 'usable_pct', '%')} |",
         "| **rendered rooms, and persons who raise no hand**: reported as a hand |"
         f" {one('empty', 'silent_pct', '%', 1)} |",
         "| **17 real rooms without a hand**, 1175 images (292 used for one choice):"
