@@ -146,3 +146,15 @@ def test_the_mean_rotation_commutes_with_a_turn_of_all(motions) -> None:
     turned[:, 3:6] = roma.rotvec_composition((turn.expand(50, 3), rows[:, 3:6]))
     mean, after = (motions.mean(given, weights)[:, 3:6] for given in (rows, turned))
     torch.testing.assert_close(after, roma.rotvec_composition((turn, mean)), atol=1e-4, rtol=0)
+
+
+@both
+def test_a_coordinate_without_width_stays_where_it_is(motions) -> None:
+    # As those that all training poses of a space share, whose least and largest are the same.
+    lower, upper = torch.tensor([0.0, -1.0, 0.3]), torch.tensor([0.0, 1.0, 0.3])
+    weights, positions = torch.full((50,), 1 / 50, dtype=torch.float64), torch.arange(50.0) / 50
+    given = particles(50, 0.5, 8)[:, :9], weights, positions.double(), particles(50, 0.5, 9)[:, :9]
+    for mode in rigid.BOUNDS:
+        found = motions.redraw(*given, lower, upper, mode)
+        assert found.isfinite().all()
+        torch.testing.assert_close(found[:, [6, 8]], lower[[0, 2]].expand(50, 2))

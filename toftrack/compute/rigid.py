@@ -25,6 +25,8 @@ PIVOT_M = (0.0, -0.085, 0.0)
 """The middle of the hand in the hand frame: near the knuckles of an adult hand."""
 _X, _Y, _Z = PIVOT_M
 BOUNDS = ("truncate", "reflect")
+LEAST_WIDTH = 1e-30
+"""What a box is taken to be wide at least where coordinates are folded back into it."""
 Redraw = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, str], Tensor]
 """See `redraw_with`, without the motion."""
 
@@ -128,9 +130,10 @@ def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
     """
     if mode == "truncate":
         return torch.minimum(torch.maximum(latent, lower), upper)
-    width = upper - lower
-    folded = torch.remainder(latent - lower, 2 * width)
-    return lower + torch.minimum(folded, 2 * width - folded)
+    # A coordinate that all training poses share has no width, by which nothing can be divided.
+    there_and_back = (2 * (upper - lower)).clamp(min=LEAST_WIDTH)
+    folded = torch.remainder(latent - lower, there_and_back)
+    return lower + torch.minimum(folded, there_and_back - folded)
 
 
 def redraw_with(compose: Callable[[Tensor, Tensor], Tensor]) -> Redraw:

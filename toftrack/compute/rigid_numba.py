@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import compiled, entry_point
-from toftrack.compute.rigid import PIVOT_M, Motions
+from toftrack.compute.rigid import LEAST_WIDTH, PIVOT_M, Motions
 
 _PIVOT = np.array(PIVOT_M)
+_LEAST_WIDTH = np.float32(LEAST_WIDTH)
 _SQUARINGS = 24
 """So often is a matrix squared of which only the main axis is to be left."""
 
@@ -137,7 +138,7 @@ def redraw_rows(particles, weights, positions, tangents, lower, upper, folds, pi
         for j in range(len(lower)):
             least, latent = lower[j], out[i, 6 + j]
             if folds:
-                there_and_back = np.float32(2) * (upper[j] - least)
+                there_and_back = max(np.float32(2) * (upper[j] - least), _LEAST_WIDTH)
                 folded = (latent - least) % there_and_back
                 out[i, 6 + j] = least + min(folded, there_and_back - folded)
             else:
