@@ -327,6 +327,20 @@ def test_the_drawn_poses_are_within_the_limits_and_of_all_kinds() -> None:
             assert (share > 0.1).all() and (share < 0.8).all()
 
 
+def test_a_sweep_prefers_no_space_that_held_out_clips_could_not_judge(tmp_path: Path) -> None:
+    clips = ",".join(("clip", *ANGLE_NAMES))
+    poses = np.degrees(random_angles(8).numpy())
+    rows = [",".join((str(n // 2), *(f"{a:.4f}" for a in pose))) for n, pose in enumerate(poses)]
+    (tmp_path / "poses.csv").write_text("\n".join(("# units: degrees", clips, *rows)) + "\n")
+    given = ["-m", "data=file", f"data.path={tmp_path / 'poses.csv'}", "pose_space.dims=3,7"]
+    given += ["compare=[]", "hydra.sweep.dir=sweep"]
+    status, out, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
+    assert status == 0, err
+    # Seven dimensions describe the eight poses that they were learned from exactly.
+    few, many = (line for line in out.splitlines() if line.startswith("#"))
+    assert "error inf degrees" in many and "error inf degrees" not in few
+
+
 def joints_of(angles: torch.Tensor, scale: float = 1.0, seed: int = 0) -> torch.Tensor:
     """(T, 5, 4, 3) metres of hands anywhere in space."""
     generator = torch.Generator().manual_seed(seed)

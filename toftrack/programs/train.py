@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import sys
 from functools import partial
@@ -35,7 +36,8 @@ _SILENT_S = 1.0
 def train(config: DictConfig) -> float:
     """Learn the configured space; returns what a sweep minimises: the root mean square error in
     degrees of the nearest points in the box to held-out clips, or of decode(encode(x)) on the
-    training poses of a single clip.
+    training poses of a single clip; infinity where too few poses are left beside the held-out ones
+    for so many dimensions.
     """
     settings: Any = OmegaConf.to_container(config.pose_space, resolve=True)
     if settings.pop("file", None) is not None:
@@ -80,7 +82,8 @@ def train(config: DictConfig) -> float:
     }
     figures = write_figures(folder, {name: partial(draw, space) for name, draw in drawn.items()})
     asked = next(row for row in rows if row.dims == dims)
-    error = (asked.reached or asked.training).degrees
+    measured = asked.training if clips == 1 else asked.reached
+    error = math.inf if measured is None else measured.degrees
     summary = _summary(kind, data, rows, asked)
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     say("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
