@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import yaml
 from helpers.tracking import CONF, ROOT
+from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 import toftrack.configuration.check as check
@@ -67,6 +68,16 @@ def test_what_cannot_be_meant_is_refused_in_one_sentence(overrides: str, words: 
     with pytest.raises(ToftrackError) as error:
         configuration(*given)
     assert words in str(error.value) and "\n" not in str(error.value)
+
+
+def test_what_a_space_is_learned_from_is_not_said_as_to_the_tracker() -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        given = ["data=natural"]
+        check.check_overrides(compose("train_pose_space", given), "train_pose_space", given)
+        given = ["pose_space.data=natural"]
+        config = compose("train_pose_space", given)
+        with pytest.raises(ToftrackError, match="says nothing here; give data=natural$"):
+            check.check_overrides(config, "train_pose_space", given)
 
 
 @pytest.mark.parametrize(

@@ -97,6 +97,11 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
             raise ToftrackError(
                 f"{word} is of learning, and pose_space.file={space['file']} is learned; give one"
             )
+    for word in overrides if name == "train_pose_space" else ():
+        if re.match(r"\+*pose_space\.data=", word):
+            raise ToftrackError(
+                f"{word} is the tracker's, and says nothing here; give {word.partition('.')[2]}"
+            )
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     chosen = [o for o in parsed if not o.is_delete() and loader.get_group_options(o.key_or_group)]
