@@ -12,8 +12,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,12 +26,13 @@ from helpers.videos import video_frames
 
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import STATES
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.results import ResultWriter, read_results
 from toftrack.output.run_folder import read_run
 from toftrack.programs.export import export
 from toftrack.programs.recover import recover
+from toftrack.programs.track import _ShapeFiles
 from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.views.overlay import caption_px
 
@@ -140,6 +143,26 @@ def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
     assert summary["frames"] == len(done) and summary["complete"] is False
     assert len(video_frames(tmp_path / "out" / "overlay.mp4")) == len(done)
     assert HandShape.load(tmp_path / "out" / "hand_shape.json").side == "right"
+
+
+def test_the_file_of_a_hand_holds_the_one_whose_fit_rests_on_most_poses(tmp_path: Path) -> None:
+    def hand(length_m: float, poses: float = 0.0) -> HandShape:
+        fitted = Fitted(("length",), (0.0,), ((0.01,),), poses, False) if poses else None
+        return replace(default_hand_shape(length_m), fitted=fitted)
+
+    tracker = SimpleNamespace(states=[SimpleNamespace(track=-1)], fitted=(hand(0.19),))
+    files = _ShapeFiles(tmp_path, tracker)  # type: ignore[arg-type]
+    for track, present, length_mm in (
+        (0, hand(0.185), 185),
+        (0, hand(0.179, 5.0), 179),
+        (1, hand(0.148), 179),  # found again: a guess
+        (1, hand(0.165, 6.0), 165),
+        (1, hand(0.172), 172),  # its fit was contradicted
+    ):
+        tracker.states[0].track, tracker.fitted = track, (present,)
+        files.save(last=True)
+        written = HandShape.load(tmp_path / "hand_shape.json")
+        assert 1e3 * written.hand_length_m == pytest.approx(length_mm)
 
 
 def test_a_recording_is_tracked_by_its_name_alone_and_a_killed_run_recovered(

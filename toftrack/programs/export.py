@@ -2,7 +2,7 @@
 
 glb: an animated hand with a skin, for Blender, Unity, Godot and web pages (needs the extra export).
 bvh: its skeleton's motion in centimetres and degrees, x right, y up, z backward, for animation
-programs; the hand is as large as at the end of the run, and held where it is lost. csv: a flat
+programs; the hand is as large as hand_shape.json says, and held where it is lost. csv: a flat
 table, for spreadsheets. The file goes into RUN.
 """
 

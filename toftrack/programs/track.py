@@ -354,13 +354,16 @@ def _opening(metadata: dict[str, Any], device: Device) -> str:
 class _ShapeFiles:
     """The hands' files of a run, hand_shape.json, of a second slot hand_shape_2.json and so on.
 
-    They are there from the start on and follow what is fitted. Between the first and the last time
-    they are a second old at most: they serve runs that are killed.
+    They are there from the start on and follow what is fitted. Of several tracks in a slot the hand
+    stays whose fit rests on most poses: that of a track which begins anew is a guess. Between the
+    first and the last time they are a second old at most: they serve runs that are killed.
     """
 
     def __init__(self, folder: Path, tracker: HandsTracker) -> None:
         self._tracker, count = tracker, len(tracker.states)
         self._paths = [folder / shape_file(slot) for slot in range(count)]
+        self._surest = [(-1, shape) for shape in tracker.fitted]
+        """The number of a track, and its hand."""
         self._saved: list[HandShape | None] = [None] * count
         self._saved_s = [-math.inf] * count
 
@@ -370,7 +373,12 @@ class _ShapeFiles:
         Raises ToftrackError when that is not possible; before the last time, it may be later.
         """
         now_s = time.monotonic()
-        for slot, (path, shape) in enumerate(zip(self._paths, self._tracker.fitted, strict=True)):
+        hands = zip(self._paths, self._tracker.states, self._tracker.fitted, strict=True)
+        for slot, (path, state, present) in enumerate(hands):
+            track, shape = self._surest[slot]
+            if state.track == track or _poses(present) >= _poses(shape):
+                shape = present
+                self._surest[slot] = state.track, present
             due = last or now_s > self._saved_s[slot] + _SHAPES_APART_S
             if shape is self._saved[slot] or not due:
                 continue
@@ -380,3 +388,8 @@ class _ShapeFiles:
             with reported if last else suppress(OSError):
                 shape.to("cpu").save(path)
                 self._saved[slot] = shape
+
+
+def _poses(shape: HandShape) -> float:
+    """How many poses the fit of a hand rests on; 0 where it was not fitted."""
+    return 0.0 if shape.fitted is None else shape.fitted.poses
