@@ -11,7 +11,12 @@ _DRAWS = 2000
 
 
 class Interval(NamedTuple):
-    """A mean over recordings with its 90 % bootstrap interval."""
+    """A mean over recordings with its 90 % bootstrap interval.
+
+    Of few recordings it is too narrow: of normally distributed figures it holds the true mean in
+    86 % of the cases with 12 of them, in 80 % with 5, 61 % with 3 and 54 % with 2; of skewed ones,
+    as shares near 100 %, in some 5 less.
+    """
 
     mean: float
     low: float

@@ -1,10 +1,10 @@
 """Pose spaces without a linear map back: kernel PCA, locally linear embedding and Isomap.
 
-Their coordinates become angles by kernel ridge regression, as in Jaeggli, Koller-Meier and Van
-Gool, "Learning generative models for monocular body pose estimation" (ACCV 2007), which the paper
-names for this (section 4); the posterior mean of a Gaussian process is the same formula. A
-straight-line fit carries the trend, so that beyond the training poses the map goes on in a line
-instead of falling back to the mean pose.
+Their coordinates become angles by kernel ridge regression, the kernel method that the paper asks
+for (section 4), where it names Jaeggli, Koller-Meier and Van Gool, "Multi-activity tracking in LLE
+body pose space" (ICCV workshop on Human Motion, 2007); the posterior mean of a Gaussian process is
+the same formula. A straight-line fit carries the trend, so that beyond the training poses the map
+goes on in a line instead of falling back to the mean pose.
 """
 
 from __future__ import annotations

@@ -92,8 +92,8 @@ def run_filter(
     generators: Sequence[torch.Generator],
     spans: Spans,
 ) -> list[ParticleSet]:
-    """The particles of B tracks after dt_s: predicted, then diffused, weighed by each track's image
-    and resampled, all of them in each call.
+    """The particles of B tracks after dt_s: predicted, resampled by the weights that they have,
+    diffused, and weighed by each track's image, all of them in each call.
 
     Nothing within waits for the device, so that it is not held up between passes.
     """
