@@ -135,6 +135,18 @@ def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: 
     assert (tmp_path / "sweep.csv").exists() and not (tmp_path / "sweep.png").exists()
 
 
+def test_spaces_are_not_compared_by_their_own_training_poses(tmp_path: Path, capsys) -> None:
+    for number, figures in enumerate(({"reached_degrees": 6.2}, {})):
+        path = tmp_path / str(number)
+        (path / ".hydra").mkdir(parents=True)
+        (path / ".hydra" / "overrides.yaml").write_text(f"- pose_space.dims={6 + number}\n")
+        summary = {"training_degrees": 1.2 - number, **figures}
+        (path / "summary.json").write_text(json.dumps(summary))
+    _, groups = report(tmp_path)
+    assert [group.error for group in groups] == [6.2, None]
+    assert "1 of 2 runs have no reached_degrees" in capsys.readouterr().out
+
+
 def test_another_figure_can_be_asked_for(sweep: Path) -> None:
     _, groups = report(sweep, "median_ms")
     assert [group.error for group in groups] == [20.0, 30.0]
