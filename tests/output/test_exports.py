@@ -9,13 +9,17 @@ import numpy as np
 import pytest
 from helpers.animation import Gltf
 from helpers.hands import hand_estimate, lost_hand
+from scipy.spatial.transform import Rotation
 
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.shape import default_hand_shape
 from toftrack.output.exports import glb_of, hand_mesh, motions_of
 
-NAMES = ("timestamp_s", "lost", "side", "joints_m", "state")
+NAMES = (
+    *("timestamp_s", "lost", "side", "joints_m", "state"),
+    *("openxr_position_m", "openxr_orientation"),
+)
 
 
 def results_of(estimates: list[Estimate]) -> dict[str, Any]:
@@ -47,6 +51,15 @@ def test_every_joint_is_a_node_with_a_key_a_frame_that_puts_it_where_it_was(side
         world = gltf.world(frame)
         places = np.stack([world[f"{n.title()}_{letter}"][:3, 3] for n in OPENXR_JOINT_NAMES])
         assert np.allclose(places, estimates[frame].openxr_position_m, atol=2e-6)
+
+
+def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
+    first, *_ = estimates = moving()  # as long as hands are on average
+    (motion,) = motions_of(results_of(estimates), (default_hand_shape(0.17),))
+    wrist, metacarpal = map(OPENXR_JOINT_NAMES.index, ("wrist", "little_metacarpal"))
+    turned = Rotation.from_quat(motion.turn[0, wrist])
+    place = motion.offset_m[0, wrist] + turned.apply(motion.offset_m[0, metacarpal])
+    assert np.allclose(place, first.openxr_position_m[metacarpal], atol=2e-6)
 
 
 def test_the_skin_follows_the_joints() -> None:

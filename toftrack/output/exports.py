@@ -64,7 +64,8 @@ def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[
     In a frame that was dropped a hand stays as the row has it, which is as it was before. Raises
     ToftrackError when no slot had a hand that was tracked.
     """
-    arrays = {name: results[name] for name in ("lost", "joints_m", "state", "side")}
+    names = ("lost", "openxr_position_m", "openxr_orientation", "side")
+    arrays = {name: results[name] for name in names}
     if arrays["lost"].ndim == 1:
         arrays = {name: array[:, None] for name, array in arrays.items()}
     time_s = _times(results["timestamp_s"])
@@ -110,23 +111,16 @@ def _motion(
     slot: int, hand: dict[str, np.ndarray], shape: HandShape, time_s: np.ndarray
 ) -> HandMotion | None:
     """The motion of a slot's hand, None where it never had one."""
-    finite = np.isfinite(hand["joints_m"]).all((1, 2)) & np.isfinite(hand["state"]).all(1)
-    tracked = ~hand["lost"].astype(bool) & finite
+    # As they are: those of one shape would not be where the hand was before that was fitted.
+    position, turned = hand["openxr_position_m"], hand["openxr_orientation"].astype(np.float64)
+    tracked = ~hand["lost"].astype(bool) & np.isfinite(position).all((1, 2))
     if not tracked.any():
         return None
-    side = hand["side"]
-    reported = list(side[tracked])
+    reported = list(hand["side"][tracked])
     shape = shape.of_side(max(SIDES, key=reported.count) if any(reported) else shape.side)
     held = np.maximum.accumulate(np.where(tracked, np.arange(len(tracked)), -1))
     held = np.where(held < 0, tracked.argmax(), held)
-    there = openxr_hand(hand["joints_m"], hand["state"], openxr_rig(shape))
-    # Until handedness was detected, or where a slot took another one.
-    (opposite,) = set(SIDES) - {shape.side}
-    other = side == opposite
-    mirrored = openxr_rig(shape.of_side(opposite))
-    as_other = openxr_hand(hand["joints_m"][other], hand["state"][other], mirrored)
-    there.position_m[other], there.orientation[other] = as_other.position_m, as_other.orientation
-    offset, turn = _relative(there.position_m[held], there.orientation[held])
+    offset, turn = _relative(position[held], turned[held])
     position, turned = _rest_joints(shape)
     rest_offset, _ = _relative(position[None], turned[None])
     return HandMotion(slot, time_s, tracked, offset, _smooth_signum(turn), rest_offset[0], shape)
