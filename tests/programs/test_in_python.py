@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from helpers.tracking import Camera, run, sample
 
 import toftrack
 from toftrack.devices.replay import Sample
+from toftrack.recordings.npz import read_recording
 
 PAPER = ("experiment=paper", *QUICK)  # whose tracker is there at once
 WORDS = ("device.name=two_hands", "hands=2", *QUICK)
@@ -110,6 +112,17 @@ def test_the_device_is_closed_however_the_loop_ends() -> None:
         except (ZeroDivisionError, toftrack.ToftrackError) as error:
             assert leaves or "unplugged" in str(error)
         assert camera.opened == 0
+
+
+def test_a_program_that_ends_within_the_loop_ends_and_keeps_its_recording(tmp_path: Path) -> None:
+    words = *PAPER, f"record={tmp_path / 'kept.npz'}", "stream=websocket", "stream.port=0"
+    program = f"import toftrack\nframes = iter(toftrack.track('device=sample', *{words}))"
+    with subprocess.Popen([sys.executable, "-c", f"{program}\nnext(frames)"]) as process:
+        try:
+            assert process.wait(100) == 0
+        finally:
+            process.kill()
+    assert len(read_recording(tmp_path / "kept.npz")) == 1
 
 
 def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import json
 import os
 import tempfile
@@ -12,6 +13,7 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from weakref import WeakSet
 
 import numpy as np
 from hydra.utils import instantiate
@@ -33,6 +35,18 @@ from toftrack.programs.export import csv_of, table_of
 
 if TYPE_CHECKING:
     import pandas
+
+_Tracked = Generator[tuple[tuple[Estimate, ...], tuple[Estimate, ...]]]
+_left_open: WeakSet[_Tracked] = WeakSet()
+"""Loops that a program may have left without an end, as one that keeps `iter(track(...))`."""
+
+
+@atexit.register
+def _close_loops() -> None:
+    """Close them while there still are the threads that servers and recorders wait for."""
+    for frames in tuple(_left_open):
+        with suppress(RuntimeError, ValueError):  # no new thread any more; one that is in it
+            frames.close()
 
 
 def track(
@@ -104,8 +118,12 @@ class Tracking:
                         raise
             return Results(read_results(Path(folder) / "track.npz"))
 
-    def _frames(self) -> Generator[tuple[tuple[Estimate, ...], tuple[Estimate, ...]]]:
+    def _frames(self) -> _Tracked:
         """Of each frame the estimates, and smoothed."""
+        _left_open.add(frames := self._followed())
+        return frames
+
+    def _followed(self) -> _Tracked:
         from toftrack.programs.track import prepared_run, run_metadata  # takes seconds
 
         config, device = self._config, self.device
