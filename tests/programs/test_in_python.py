@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import csv
+import errno
 import json
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from helpers.tracking import Camera, run, sample
 
 import toftrack
 from toftrack.devices.replay import Sample
+from toftrack.programs.recover import recover
 from toftrack.recordings.npz import read_recording
 
 PAPER = ("experiment=paper", *QUICK)  # whose tracker is there at once
@@ -146,6 +149,27 @@ def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:
         toftrack.track(ended, *PAPER).results()
     with pytest.raises(toftrack.ToftrackError, match="fps=0 is not possible"):
         toftrack.PushDevice(Sample().camera, 0)
+
+
+def test_results_that_find_no_room_are_recovered_as_is_said(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    tracking = toftrack.track("device=sample", "device.stop=3", *PAPER)
+    with monkeypatch.context() as disk:
+        disk.setattr("toftrack.output.results.write_results", full)
+        with pytest.raises(toftrack.ToftrackError, match="No space left.*the 3 frames") as caught:
+            tracking.results()
+    folder = Path(str(caught.value).rpartition("`toftrack recover ")[2].rstrip("`"))
+    assert folder.parent == tmp_path and recover(folder)
+    assert len(toftrack.read_results(folder / "track.npz")["lost"]) == 3
+    assert len(tracking.results().lost) == 3 and list(tmp_path.iterdir()) == [folder]
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+    with pytest.raises(toftrack.ToftrackError, match="no place for the results.*set TMPDIR"):
+        tracking.results()
 
 
 def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:

@@ -37,6 +37,10 @@ _PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
 """Of the metadata: what is said of each."""
 
 
+class UnwritableError(ToftrackError):
+    """The folder of a run cannot be written any more; what is in it may be recovered."""
+
+
 class ResultWriter:
     """Writes a run's result files into a folder; use it with `with`.
 
@@ -322,12 +326,12 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 def _unwritable(folder: Path, error: OSError, frames: int | None = None) -> ToftrackError:
     reason = error.strerror or error
     if frames and not folder.exists():
-        return ToftrackError(
+        return UnwritableError(
             f"the output folder '{folder}' was removed or renamed while the run went on; where it "
             f"is now, `toftrack recover` makes the files of the {frames} frames until then"
         )
     if frames:
-        return ToftrackError(
+        return UnwritableError(
             f"the output folder '{folder}' cannot be written any more ({reason}); the {frames} "
             f"frames until then are in its {LINES}: make room, or make it writable, then `toftrack "
             f"recover {folder}`"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import shutil
 import tempfile
 import time
 from collections.abc import Generator, Iterator
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
@@ -28,7 +29,7 @@ from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import KINDS, json_line
 from toftrack.output.records import facts_for_readers
-from toftrack.output.results import ResultWriter, estimates_of, read_results
+from toftrack.output.results import ResultWriter, UnwritableError, estimates_of, read_results
 from toftrack.output.stream import ReaderGoneError
 from toftrack.programs.applications import with_recording
 from toftrack.programs.export import csv_of, table_of
@@ -106,7 +107,7 @@ class Tracking:
         meanwhile on the disk. As in a run's files, nothing is smoothed unless smooth.results=true.
         Raises ToftrackError when there was no frame.
         """
-        with closing(self._frames()) as frames, tempfile.TemporaryDirectory() as folder:
+        with closing(self._frames()) as frames, _scratch_folder() as folder:
             if (first := next(frames, None)) is None:
                 raise ToftrackError("the device delivered no frame; nothing was tracked")
             with ResultWriter(folder, self._metadata, JOINT_NAMES) as writer:
@@ -116,7 +117,7 @@ class Tracking:
                 except KeyboardInterrupt:
                     if not self.device.live:
                         raise
-            return Results(read_results(Path(folder) / "track.npz"))
+            return Results(read_results(folder / "track.npz"))
 
     def _frames(self) -> _Tracked:
         """Of each frame the estimates, and smoothed."""
@@ -135,6 +136,21 @@ class Tracking:
                     tracked, smoothed = run.frame(frame, time.perf_counter(), view)
                     self.camera, self.depth_m = tracked.camera, tracked.depth_m
                     yield tracked.estimates, smoothed
+
+
+@contextmanager
+def _scratch_folder() -> Iterator[Path]:
+    """A folder that is gone afterwards, but for that of a run which says how to recover it."""
+    remedy = "set TMPDIR to a folder that can be written"
+    with reported_errors("there is no place for the results meanwhile", remedy):
+        folder = Path(tempfile.mkdtemp(prefix="toftrack-"))
+    with ExitStack() as stack:
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        try:
+            yield folder
+        except UnwritableError:
+            stack.pop_all()
+            raise
 
 
 @dataclass(frozen=True, eq=False, repr=False)
