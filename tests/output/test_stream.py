@@ -139,6 +139,17 @@ def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
             assert receiver.recv(65535).decode() == json_line((one,)) + "\n"
 
 
+def test_a_name_of_two_addresses_is_that_of_ipv4(
+    receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port = receiver.getsockname()[1]
+    v4, v6 = (socket.getaddrinfo(at, port, type=socket.SOCK_DGRAM) for at in ("127.0.0.1", "::1"))
+    monkeypatch.setattr(socket, "getaddrinfo", lambda *_, **__: v6 + v4)
+    with udp_stream("localhost", port) as stream:
+        stream.send((hand_estimate(3),))
+    assert json.loads(receiver.recv(65535))["index"] == 3
+
+
 @pytest.mark.parametrize(
     ("host", "words"),
     [

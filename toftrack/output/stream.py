@@ -156,6 +156,8 @@ class UdpStream(Stream):
         advice = "give the name or address of the machine that listens"
         with reported_errors(what, advice, OSError, UnicodeError):
             found = socket.getaddrinfo(str(host), port, type=socket.SOCK_DGRAM)
+        # Most receivers listen at IPv4 only, while localhost is often ::1 first.
+        found.sort(key=lambda one: one[0] != socket.AF_INET)
         family, kind, protocol, _, address = found[0]
         self._address: Any = address
         self._kind = family, kind, protocol
