@@ -253,6 +253,15 @@ def test_help_of_a_module_that_is_run_is_no_error(words: str) -> None:
     assert done.returncode == 0 and "usage: python -m toftrack.training" in done.stdout
 
 
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
+def test_a_log_on_a_full_disk_ends_no_run(tmp_path: Path) -> None:
+    words = "track", "view=none", "device.stop=2", "experiment=paper", f"hydra.run.dir={tmp_path}"
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run([sys.executable, "-m", "toftrack", *words], stderr=full, check=False)
+    assert done.returncode == 0
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
+
+
 @pytest.mark.parametrize(("closed", "status"), [("0<&-", 0), ("2>&-", 0), ("1>&-", 1)])
 def test_a_program_runs_with_closed_streams_but_streams_to_none(
     closed: str, status: int, tmp_path: Path

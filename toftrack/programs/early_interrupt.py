@@ -1,5 +1,5 @@
-"""Ctrl-C while a program still loads, and streams that are closed: imported before everything else,
-by programs alone.
+"""Ctrl-C while a program still loads, and streams that are closed or find no room: imported before
+everything else, by programs alone.
 
 Within the first second nothing is written yet, and an exception would end in whatever is being
 imported: so the process ends at once, with status 130. `programs.shutdown` takes over when the
@@ -8,11 +8,27 @@ is done Ctrl-C does nothing any more: its status is known.
 """
 
 import atexit
+import errno
 import io
 import os
 import signal
 import sys
 from types import FrameType
+from typing import Any
+
+
+class _Log(io.FileIO):
+    """Standard error: what finds no room, as in a file on a full disk, is left out, and ends
+    nothing that goes on for weeks.
+    """
+
+    def write(self, data: Any) -> int:
+        try:
+            return super().write(data)
+        except OSError as error:
+            if error.errno not in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None)):
+                raise
+            return memoryview(data).nbytes
 
 
 def _end(number: int, frame: FrameType | None) -> None:
@@ -23,6 +39,9 @@ def _end(number: int, frame: FrameType | None) -> None:
 for stream in (sys.stdin, sys.stdout, sys.stderr):
     if stream is None:  # closed: else the next file that is opened takes its descriptor
         os.open(os.devnull, os.O_RDWR)
+if (own := sys.__stderr__) is not None and sys.stderr is own:
+    room = io.BufferedWriter(_Log(own.fileno(), "w", closefd=False))
+    sys.stderr = io.TextIOWrapper(room, own.encoding, own.errors, line_buffering=True)
 for stream in (sys.stdout, sys.stderr):
     # A file's name may have what an encoding lacks; what is no text in it passes through UTF-8.
     if isinstance(stream, io.TextIOWrapper) and (
