@@ -248,7 +248,7 @@ def test_what_is_removed_while_it_grows_is_one_sentence_and_nobody_waits(
         go(path.with_name("hand.npz.part"))
         for _ in range(2 * module._WAITING):  # more than would wait
             recorder.put(one_frame(), wait=True)
-    assert recorder.failed and not path.exists()
+    assert recorder.failed and not path.exists() and recorder.words() == ""
     assert "was removed or renamed while the recording grew" in (recorder.ended or "")
 
 

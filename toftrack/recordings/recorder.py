@@ -86,7 +86,7 @@ class Recorder:
         self._source, self._limit_gb, self._overwrite = source, limit_gb, overwrite
         self._tell = tell
         self._facts: Facts | None = None
-        self._clock, self._strange = _Clock(), 0
+        self._clock, self._strange, self._made = _Clock(), 0, False
         self._file = self._open()
         self._queue: queue.Queue[Frame | None] = queue.Queue(_WAITING)
         self._second = ThreadPoolExecutor(1, "toftrack-amplitude")
@@ -112,9 +112,9 @@ class Recorder:
         self._second.shutdown()
 
     def words(self) -> str:
-        """What became of it, once it is closed; "" where no frame came."""
+        """What became of it, once it is closed; "" where there is none."""
         missed = f", {self.missed} more came too fast" if self.missed else ""
-        return f"{self.path}: {self.frames} frames{missed}" if self.frames else ""
+        return f"{self.path}: {self.frames} frames{missed}" if self._made else ""
 
     def __enter__(self) -> Self:
         return self
@@ -225,6 +225,7 @@ class Recorder:
                 raise ToftrackError(f"the recording '{self.path}' was not made: {gone}")
             if self.frames:
                 finish(self._part, self.path, self._overwrite)
+                self._made = True
                 reported = f"the recording '{self.path}' ends after {self.frames} frames: {why}"
             else:
                 self._part.unlink(missing_ok=True)
