@@ -16,12 +16,11 @@ from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.programs import convert, record
-from toftrack.recordings.bare import BareFacts
-from toftrack.recordings.image_folder import PngFolderWriter, read_image_folder
+from toftrack.recordings.bare import Given
+from toftrack.recordings.image_folder import ImageFolder, PngFolderWriter
 from toftrack.recordings.npz import read_recording
-from toftrack.recordings.srs import read_srs
+from toftrack.recordings.srs import SrsRecording
 
-REPORTED = BareFacts((30.0, 30.0, 16.0, 12.0))
 EMULATED = ("device.transport=emulated", "device.emulated.fps=500")
 
 
@@ -34,7 +33,7 @@ def srs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def raw(path: Path) -> list[bytes]:
-    recording = read_srs(path)
+    recording = SrsRecording(path)
     frames = [recording.raw(index) for index in range(len(recording))]
     recording.close()
     return frames
@@ -55,7 +54,7 @@ def test_there_and_back_is_bit_exact(srs: Path, tmp_path: Path, between: str) ->
     convert.main([str(srs), str(tmp_path / between)])
     convert.main([str(tmp_path / between), str(tmp_path / "back.srs")])
     assert raw(tmp_path / "back.srs") == raw(srs)
-    first, second = read_srs(srs), read_srs(tmp_path / "back.srs")
+    first, second = SrsRecording(srs), SrsRecording(tmp_path / "back.srs")
     np.testing.assert_array_equal(first.timestamp_s, second.timestamp_s)
     np.testing.assert_array_equal(first.camera.K, second.camera.K)
     assert first.metadata == second.metadata
@@ -100,18 +99,19 @@ def test_the_lens_goes_before_an_npz_s_own_and_other_facts_stand_in_for_missing_
     depth = np.full((3, 6, 8), 0.5, np.float32)
     np.savez(tmp_path / "bare.npz", depth_m=depth)
     np.savez(tmp_path / "whole.npz", depth_m=depth, K=np.diag((9.0, 9, 1)), fps=10.0)
-    lens = BareFacts((30.0, 30.0, 3.5, 2.5), fps=12.0)
-    convert.convert(tmp_path / "bare.npz", tmp_path / "made.npz", bare=lens)
+    lens = Given((30.0, 30.0, 3.5, 2.5), fps=12.0)
+    convert.convert(tmp_path / "bare.npz", tmp_path / "made.npz", lens)
     made = read_recording(tmp_path / "made.npz")
     assert (made.camera.K[0, 0], made.fps) == (30, pytest.approx(12))
     with pytest.raises(ToftrackError, match=r"says its fps itself.*--fps"):
-        convert.convert(tmp_path / "whole.npz", tmp_path / "no.npz", bare=lens)
-    convert.convert(tmp_path / "whole.npz", tmp_path / "other.npz", bare=replace(lens, fps=None))
+        convert.convert(tmp_path / "whole.npz", tmp_path / "no.npz", lens)
+    convert.convert(tmp_path / "whole.npz", tmp_path / "other.npz", replace(lens, fps=None))
     other = read_recording(tmp_path / "other.npz")
     assert (other.camera.K[0, 0], other.fps) == (30, pytest.approx(10))
     Camera(np.diag((9.0, 9, 1)), 9, 6).save(tmp_path / "wide.json")
+    wide = Given(camera_file=tmp_path / "wide.json")
     with pytest.raises(ToftrackError, match="9x6 pixels, but the recording has 8x6"):
-        convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz", tmp_path / "wide.json")
+        convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz", wide)
     with pytest.raises(ToftrackError, match="key 'K'.*--intrinsics"):
         convert.convert(tmp_path / "bare.npz", tmp_path / "no.npz")
 
@@ -119,19 +119,17 @@ def test_the_lens_goes_before_an_npz_s_own_and_other_facts_stand_in_for_missing_
 def test_convert_errors(srs: Path, tmp_path: Path) -> None:
     (tmp_path / "there.npz").write_bytes(b"")
     Camera(np.eye(3), 8, 6).save(tmp_path / "camera.json")
-    for arguments, words in (
-        ((srs, tmp_path / "there.npz"), "exists already"),
-        ((srs, tmp_path / "a.bag"), "neither"),
-        ((srs, srs), "itself"),
-        ((srs, tmp_path / "a.npz", tmp_path / "camera.json"), "8x6"),
-        ((srs, tmp_path / "a", None, 20, 2.0), "--unit"),
-        (
-            (srs, tmp_path / "b", tmp_path / "camera.json", 20, None, False, None, REPORTED),
-            "--camera and --intrinsics both",
-        ),
+    camera = ("--camera", str(tmp_path / "camera.json"))
+    for target, options, words in (
+        ("there.npz", (), "exists already"),
+        ("a.bag", (), "neither"),
+        (srs, (), "itself"),
+        ("a.npz", camera, "8x6"),
+        ("a", ("--unit", "2.0"), "--unit"),
+        ("b", (*camera, *"--intrinsics 30 30 16 12".split()), "--camera and --intrinsics. both"),
     ):
         with pytest.raises(ToftrackError, match=words):
-            convert.convert(*arguments)
+            convert.main([str(srs), str(tmp_path / target), *options])
 
 
 @pytest.mark.parametrize("name", ["there.npz", "there.srs"])
@@ -170,7 +168,8 @@ def test_lens_and_polynomial_are_not_lost_in_npz(tmp_path: Path) -> None:
     camera = Camera(np.diag((30.0, 31, 1)), 32, 24, np.full(4, 0.1), (0.01,), lens="fisheye")
     camera.save(tmp_path / "camera.json")
     np.save(tmp_path / "a.npy", np.ones((2, 24, 32)))
-    convert.convert(tmp_path / "a.npy", tmp_path / "out.npz", tmp_path / "camera.json")
+    given = Given(camera_file=tmp_path / "camera.json")
+    convert.convert(tmp_path / "a.npy", tmp_path / "out.npz", given)
     assert read_recording(tmp_path / "out.npz").camera.to_dict() == camera.to_dict()
 
 
@@ -185,7 +184,7 @@ def test_record_survives_faults_with_every_whole_frame(tmp_path: Path) -> None:
     path = tmp_path / "a.srs"
     faults = "device.emulated.faults=[unplug_during@5,short@8,stall@11]"
     record.main([str(path), *EMULATED, faults, "device.emulated.replug_s=0.05"])
-    recording = read_srs(path)
+    recording = SrsRecording(path)
     assert len(recording) == 98  # of the sample's 100, two were damaged; a stall costs none
 
 
@@ -229,7 +228,7 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     with PngFolderWriter(tmp_path / "f", camera, 0.0005, True, 30.0, {"a": 1}) as writer:
         for number in range(2):
             writer.append(depth[number], amplitude, number / 7)
-    folder = read_image_folder(tmp_path / "f")
+    folder = ImageFolder(tmp_path / "f")
     np.testing.assert_array_equal(folder.image(0)[0][0, :5], 0)
     np.testing.assert_allclose(folder.image(1)[0], depth[1], atol=0.00026)
     np.testing.assert_array_equal(folder.image(1)[1], amplitude)
@@ -254,4 +253,4 @@ def test_broken_folders_are_reported(tmp_path: Path, changes: dict[str, Any], wo
         if isinstance(content, bytes):
             (folder / name).write_bytes(content)
     with pytest.raises(ToftrackError, match=words):
-        read_image_folder(folder).image(0)
+        ImageFolder(folder).image(0)

@@ -25,8 +25,8 @@ from toftrack.output.run_folder import read_run
 from toftrack.programs import convert
 from toftrack.programs.main import main
 from toftrack.recordings import image_folder
-from toftrack.recordings.bare import BareFacts
-from toftrack.recordings.image_folder import read_image_folder
+from toftrack.recordings.bare import Given
+from toftrack.recordings.image_folder import ImageFolder
 from toftrack.recordings.images import decoded_png
 
 LENS = "device.intrinsics=[201,202,87,71]"
@@ -48,7 +48,7 @@ def test_the_camera_file_that_the_page_shows_is_read(folder: Path) -> None:
     page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"<!-- test: camera.json -->\n```json\n(.*?)```", page, re.DOTALL)
     (folder / "camera.json").write_text(example)
-    read = read_image_folder(folder)
+    read = ImageFolder(folder)
     np.testing.assert_array_equal(read.camera.K, [[200, 0, 88], [0, 200, 72], [0, 0, 1]])
     assert (read.camera.width, read.camera.height) == (176, 144)
     assert (read.unit_m, read.fps, read.radial) == (0.001, 25, False)
@@ -77,7 +77,7 @@ def test_lenses_that_are_none_are_reported(given: str, folder: Path) -> None:
 
 
 def test_a_lens_is_reported_once(folder: Path) -> None:
-    read_image_folder(folder, bare=BareFacts([201, 202, 87, 71])).camera.save(folder / "mine.json")
+    ImageFolder(folder, Given([201, 202, 87, 71])).camera.save(folder / "mine.json")
     words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
     with make_device(*words) as device:
         np.testing.assert_array_equal(device.camera.K, K)
@@ -106,7 +106,7 @@ def test_a_chunk_that_claims_gigabytes_is_not_handed_to_the_decoder(
 
 
 COLOUR = cv2.imencode(".png", np.zeros((24, 32, 3), np.uint8))[1].tobytes()
-GIVEN = BareFacts((40.0, 40.0, 15.5, 11.5))
+GIVEN = Given((40.0, 40.0, 15.5, 11.5))
 DEPTH = np.random.default_rng(0).uniform(0.3, 2, (3, 24, 32)).astype(np.float32)
 
 
@@ -160,7 +160,7 @@ def test_the_depth_among_the_images_is_read_and_the_rest_told(
         for pattern, content in LAYOUTS[layout].items()
     }
     path = laid_out(tmp_path, files, zipped)
-    store = read_image_folder(path, bare=GIVEN)
+    store = ImageFolder(path, GIVEN)
     np.testing.assert_allclose([store.image(n)[0] for n in (0, 1, 2)], DEPTH, atol=0.00051)
     store.close()
     assert (store.left_out is not None) == any(
@@ -189,7 +189,7 @@ def test_images_that_are_no_depth_are_reported(
         exr(0)
     for zipped in (False, True):
         with pytest.raises(ToftrackError, match=words):
-            read_image_folder(laid_out(tmp_path, files, zipped), bare=GIVEN)
+            ImageFolder(laid_out(tmp_path, files, zipped), GIVEN)
 
 
 @pytest.mark.parametrize(
@@ -211,7 +211,7 @@ def test_archives_that_lead_elsewhere_are_refused(
         entry.filename, entry.external_attr, entry.compress_type = name, mode << 16, method
         archive.writestr(entry, png(0))
     with pytest.raises(ToftrackError, match=words):
-        read_image_folder(tmp_path / "a.zip", bare=GIVEN)
+        ImageFolder(tmp_path / "a.zip", GIVEN)
 
 
 def test_archives_that_lie_or_would_fill_the_memory_are_refused(
@@ -220,31 +220,31 @@ def test_archives_that_lie_or_would_fill_the_memory_are_refused(
     monkeypatch.setattr(image_folder, "_MOST_BYTES", 2**20)
     path = laid_out(tmp_path, {"1.png": png(0) + bytes(2**22)}, True)
     with pytest.raises(ToftrackError, match="larger than 1 MB"):
-        read_image_folder(path, bare=GIVEN)
+        ImageFolder(path, GIVEN)
     content = laid_out(tmp_path, {"1.png": png(0)}, True).read_bytes()
     for size in (20, 2**31):  # in both places that tell it
         forged = content.replace(struct.pack("<I", len(png(0))), struct.pack("<I", size))
         path.write_bytes(forged)
         with pytest.raises(ToftrackError, match="1.png.*cannot be (read|used)"):
-            read_image_folder(path, bare=GIVEN)
+            ImageFolder(path, GIVEN)
     for seed in range(60):
         path.write_bytes(damaged(content, seed))
         with contextlib.suppress(ToftrackError):
-            read_image_folder(path, bare=GIVEN).image(0)
+            ImageFolder(path, GIVEN).image(0)
 
 
 @pytest.mark.parametrize("text", ["1 " * 2**20, "x" * 2**22, "nan"])
 def test_times_that_cannot_be_meant_take_no_time_and_no_page(tmp_path: Path, text: str) -> None:
     path = laid_out(tmp_path, {"1.png": png(0), "timestamps.txt": text.encode()}, True)
     with pytest.raises(ToftrackError, match="timestamps.txt") as caught:
-        read_image_folder(path, bare=GIVEN)
+        ImageFolder(path, GIVEN)
     assert len(str(caught.value)) < 999
 
 
 def test_names_of_others_do_not_command_the_terminal(tmp_path: Path) -> None:
     path = laid_out(tmp_path, {"a\x1b[2J\n.png": b"nonsense"}, True)
     with pytest.raises(ToftrackError) as caught:
-        read_image_folder(path, bare=GIVEN)
+        ImageFolder(path, GIVEN)
     assert str(caught.value).isprintable()
 
 
@@ -253,12 +253,12 @@ def test_an_exr_that_is_damaged_is_read_or_told(tmp_path: Path) -> None:
     for seed in range(100):  # OpenEXR's older interface ended the process at one of twenty
         path = laid_out(tmp_path, {"1.exr": damaged(content, seed)}, False)
         with contextlib.suppress(ToftrackError):
-            read_image_folder(path, bare=GIVEN)
+            ImageFolder(path, GIVEN)
 
 
 def test_an_archive_is_converted_with_its_camera_and_times(tmp_path: Path) -> None:
     files = {f"take/depth/{n}.png": png(n) for n in range(3)} | {"take/rgb/1.png": COLOUR}
-    read_image_folder(laid_out(tmp_path, files, True), bare=GIVEN).camera.save(tmp_path / "c.json")
+    ImageFolder(laid_out(tmp_path, files, True), GIVEN).camera.save(tmp_path / "c.json")
     files |= {"take/camera.json": (tmp_path / "c.json").read_bytes()}
     files |= {"take/depth/timestamps.txt": b"1 1.5 2"}
     convert.main([str(laid_out(tmp_path, files, True)), str(tmp_path / "out.npz")])

@@ -32,9 +32,8 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings import ros_messages
-from toftrack.recordings.bag_names import is_bag
 from toftrack.recordings.ros_messages import camera_of, decoded_rvl
-from toftrack.recordings.rosbag import read_rosbag
+from toftrack.recordings.rosbag import RosBag, is_bag
 from toftrack.recordings.store import open_recording
 
 CAMERA = Camera(np.array([[40.0, 0, 15.5], [0, 41.0, 11.5], [0, 0, 1]]), 32, 24)
@@ -106,7 +105,7 @@ def test_messages_of_one_time_are_told_apart(tmp_path: Path, kind: str) -> None:
     messages = recording(depth, CAMERA)
     for message in messages[3:7]:
         message.recorded_ns = messages[3].recorded_ns  # a recorder that was late
-    store = read_rosbag(write_bag(tmp_path, kind, messages))
+    store = RosBag(write_bag(tmp_path, kind, messages))
     for number in (4, 2, 3, 8, 0, 1):
         np.testing.assert_allclose(store.image(number)[0], depth[number], atol=1e-6)
     store.close()
@@ -127,10 +126,10 @@ def test_a_file_of_a_ros_2_bag_is_one_too_and_so_is_a_folder_without_metadata(
 
 def test_a_camera_info_may_come_late_and_without_one_a_camera_file_serves(tmp_path: Path) -> None:
     late = write_bag(tmp_path, "mcap", recording(some_depth(), CAMERA, info_at=5))
-    np.testing.assert_array_equal(read_rosbag(late).camera.K, CAMERA.K)
+    np.testing.assert_array_equal(RosBag(late).camera.K, CAMERA.K)
     path = write_bag(tmp_path, "bag", recording(some_depth(), CAMERA, info_at=99))
     with pytest.raises(ToftrackError, match=f"no message of {INFO}.*camera.file=FILE"):
-        read_rosbag(path)
+        RosBag(path)
     CAMERA.save(tmp_path / "camera.json")
     assert Replay(path, camera_file=tmp_path / "camera.json").camera.K[0, 0] == 40
 
@@ -139,7 +138,7 @@ def test_a_camera_of_another_size_is_refused_before_its_lens_is_laid_out(tmp_pat
     bent = Camera(CAMERA.K * [[900], [900], [1]], 32 * 900, 24 * 900, (0.1, 0.0, 0.0, 0.0))
     path = write_bag(tmp_path, "mcap", recording(some_depth(), bent))
     with pytest.raises(ToftrackError, match="32x24 pixels, but its camera 28800x21600"):
-        read_rosbag(path)
+        RosBag(path)
 
 
 def test_two_topics_of_depth_are_listed_and_one_is_chosen(tmp_path: Path) -> None:
@@ -170,7 +169,7 @@ def test_bags_without_depth_are_reported(
 ) -> None:
     path = write_bag(tmp_path, "bag", messages)
     with pytest.raises(ToftrackError, match=words):
-        read_rosbag(path)
+        RosBag(path)
 
 
 def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -186,7 +185,7 @@ def test_a_damaged_message_ends_the_recording_before_it(tmp_path: Path) -> None:
     at = [i for i in range(len(content)) if content.startswith(b"16UC1", i)][4]
     # The length of the text before it.
     path.write_bytes(content[: at - 4] + b"\xff\xff\xff\x7f" + content[at:])
-    store = read_rosbag(path)
+    store = RosBag(path)
     assert len(store) == 4 and "cannot be read" in (store.damage or "")
     assert len(list(Replay(path))) == 4
 

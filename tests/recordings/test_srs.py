@@ -20,7 +20,7 @@ from toftrack.recordings.sr_frame import (
     encode_frame,
     unambiguous_range_m,
 )
-from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter, read_srs
+from toftrack.recordings.srs import SrsFacts, SrsInit, SrsRecording, SrsWriter
 
 RANGE_M = unambiguous_range_m(20)
 FRAMES = 4
@@ -60,7 +60,7 @@ def path(tmp_path: Path) -> Path:
 
 def test_what_is_written_is_read_back(path: Path) -> None:
     frames = record(path)
-    recording = read_srs(path)
+    recording = SrsRecording(path)
     assert [recording.raw(i) for i in range(len(recording))] == frames
     np.testing.assert_allclose(recording.timestamp_s, 100 + 0.04 * np.arange(FRAMES))
     assert recording.fps == pytest.approx(25)
@@ -79,14 +79,14 @@ def test_what_is_written_is_read_back(path: Path) -> None:
 def test_the_vendors_files_are_read(path: Path) -> None:
     calibration, unknown = (4, b"<xml/>"), (99, b"something else")
     path.write_bytes(vendors(INIT, unknown, CONFIGURE, calibration, FRAME, CONFIGURE, FRAME))
-    recording = read_srs(path)
+    recording = SrsRecording(path)
     assert len(recording) == 2
     assert recording.raw(1) == FRAME[1]
     assert recording.init.serial_number == 5
     assert (recording.camera.K[0, 2], recording.camera.K[1, 2]) == (92, 60)
     assert recording.fps == 25
     assert recording.range_m == RANGE_M
-    assert read_srs(path, modulation_mhz=40).range_m == pytest.approx(3.747, abs=1e-3)
+    assert SrsRecording(path, modulation_mhz=40).range_m == pytest.approx(3.747, abs=1e-3)
 
 
 def test_decode_undoes_encode() -> None:
@@ -122,9 +122,9 @@ def test_cut_off_anywhere_keeps_the_whole_frames_before(path: Path) -> None:
         count = sum(end <= length for end in ends)
         if count == 0:
             with pytest.raises(ToftrackError, match=path.name):
-                read_srs(path)
+                SrsRecording(path)
             continue
-        recording = read_srs(path)
+        recording = SrsRecording(path)
         assert [recording.raw(i) for i in range(len(recording))] == frames[:count]
         assert (recording.damage is None) == (length in ends)
         recording.close()
@@ -147,7 +147,7 @@ def test_cut_off_anywhere_keeps_the_whole_frames_before(path: Path) -> None:
 def test_broken_files_are_reported(path: Path, content: bytes, words: str) -> None:
     path.write_bytes(content)
     with pytest.raises(ToftrackError, match=words) as caught:
-        read_srs(path)
+        SrsRecording(path)
     assert path.name in str(caught.value)
 
 
@@ -158,7 +158,7 @@ def test_a_recording_that_grows_is_not_taken_away_by_another(path: Path) -> None
         with pytest.raises(ToftrackError, match="being recorded just now"):
             SrsWriter(path, overwrite=True)
         writer.append(raw_frames(1)[0], 0.04)
-    assert len(read_srs(path)) == 2
+    assert len(SrsRecording(path)) == 2
     with pytest.raises(ToftrackError, match="exists already"):
         SrsWriter(path)
     SrsWriter(path, overwrite=True).close()
@@ -171,7 +171,7 @@ def test_a_full_disk_is_reported_and_the_whole_frames_are_kept(
     with files_of_at_most(two_frames_and_a_half):
         with pytest.raises(ToftrackError, match="2 whole frames are kept"):
             record(path, 9)
-    recording = read_srs(path)
+    recording = SrsRecording(path)
     assert [recording.raw(i) for i in range(len(recording))] == raw_frames(2)
     assert recording.damage is None
 
@@ -182,7 +182,7 @@ def test_kill_9_while_recording_keeps_every_whole_frame(path: Path) -> None:
     killed_when(
         lambda: path.exists() and path.stat().st_size > size, "record", str(path), *settings
     )
-    recording, sample = read_srs(path), Path(__file__).parents[2] / "toftrack/data/sample.npz"
+    recording, sample = SrsRecording(path), Path(__file__).parents[2] / "toftrack/data/sample.npz"
     truth = read_recording(sample)
     lengths = np.sqrt(1 + (truth.camera.normalised_rays() ** 2).sum(-1)).astype(np.float32)
     assert len(recording) == (path.stat().st_size - 600) // (FRAME_BYTES + 24)

@@ -20,13 +20,13 @@ from toftrack.api import make_device
 from toftrack.errors import ToftrackError
 from toftrack.programs import convert
 from toftrack.recordings import matlab, stacks
-from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.store import ELSEWHERE, open_recording
 
 COUNT, HEIGHT, WIDTH = 5, 24, 32
-GIVEN = BareFacts((40.0, 40.0, 15.5, 11.5))
+GIVEN = Given((40.0, 40.0, 15.5, 11.5))
 RANDOM = np.random.default_rng(0)
 WORDS = RANDOM.integers(300, 2000, (COUNT, HEIGHT, WIDTH)).astype(np.uint16)
 METRES = WORDS.astype(np.float32) / 1000
@@ -82,7 +82,7 @@ each_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 def opened(path: Path, dataset: str | None = None) -> FrameStore:
-    return open_recording(path, bare=BareFacts(GIVEN.intrinsics, dataset=dataset))
+    return open_recording(path, Given(GIVEN.intrinsics, dataset=dataset))
 
 
 @each_kind

@@ -13,7 +13,7 @@ from helpers.damage import damaged
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings import npz
-from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.recordings.npz import StreamedImages
@@ -23,7 +23,7 @@ from toftrack.recordings.store import open_recording
 
 COUNT = 9
 CAMERA = Camera(np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]]), 320, 288)
-GIVEN = BareFacts((252.0, 253.0, 166.0, 140.0))
+GIVEN = Given((252.0, 253.0, 166.0, 140.0))
 RANGE_M = unambiguous_range_m(20)
 
 
@@ -95,7 +95,7 @@ def path(kind: str, tmp_path: Path, words: np.ndarray, monkeypatch: pytest.Monke
 
 
 def opened(path: Path) -> FrameStore:
-    return open_recording(path, bare=GIVEN)
+    return open_recording(path, GIVEN)
 
 
 @each_kind

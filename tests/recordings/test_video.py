@@ -20,12 +20,12 @@ from helpers.videos import (
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.bare import Given
 from toftrack.recordings.store import open_recording
 
 K = np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]])
 ABOUT = calibration(K, 512, (96, 90))
-REPORTED = BareFacts((30.0, 31.0, 15.5, 11.5))
+REPORTED = Given((30.0, 31.0, 15.5, 11.5))
 
 
 def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
@@ -124,7 +124,7 @@ def test_lossless_grey_videos_are_depth_in_millimetres(
     tmp_path: Path, name: str, codec: str, pixels: str
 ) -> None:
     pixels_in = words()
-    store = open_recording(write_grey(tmp_path / name, pixels_in, codec, pixels), bare=REPORTED)
+    store = open_recording(write_grey(tmp_path / name, pixels_in, codec, pixels), REPORTED)
     assert len(store) == 7
     for number, image in enumerate(pixels_in):
         depth, amplitude = store.image(number)
@@ -139,7 +139,7 @@ def test_a_list_of_other_files_is_no_video(tmp_path: Path, name: str) -> None:
     write_grey(tmp_path / "other.mkv", words())
     (tmp_path / name).write_text("ffconcat version 1.0\nfile other.mkv\n")
     with pytest.raises(ToftrackError, match="cannot be read as a video"):
-        open_recording(tmp_path / name, bare=REPORTED)
+        open_recording(tmp_path / name, REPORTED)
 
 
 def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:

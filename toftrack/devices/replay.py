@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +13,10 @@ import numpy as np
 
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError, check_number
-from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
-from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.bare import Given
 from toftrack.recordings.doubts import doubts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import (
     FIRST_SAMPLE,
     open_recording,
@@ -41,12 +39,10 @@ class Replay(BaseDevice):
 
     path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, counted
     from when the first one is done, and drop a frame when the next one is already due (the last is
-    always delivered); otherwise every frame, as fast as it is asked for.  camera_file, intrinsics
-    (fx, fy, cx, cy in pixels): instead of the recording's own camera.  unit_m (metres of one step
-    of whole numbers), fps, dataset (of a `.h5` or `.mat` that has several): of recordings that do
-    not say it.  topic: of a ROS bag that has several of depth images.  store: the recording,
-    where it is open already. Raises ToftrackError: the recording or the camera cannot be used, or
-    the range lies outside.
+    always delivered); otherwise every frame, as fast as it is asked for.  store: the recording,
+    where it is open already.  given: the fields of `Given`, what the recording does not say itself,
+    and another camera instead of its own. Raises ToftrackError: the recording or the camera cannot
+    be used, or the range lies outside.
     """
 
     def __init__(
@@ -56,21 +52,13 @@ class Replay(BaseDevice):
         stop: int | None = None,
         realtime: bool = False,
         repeat: bool = False,
-        camera_file: str | Path | None = None,
-        modulation_mhz: int = DEFAULT_MODULATION_MHZ,
-        intrinsics: Sequence[float] | None = None,
-        unit_m: float | None = None,
-        fps: float | None = None,
-        dataset: str | None = None,
-        topic: str | None = None,
         store: FrameStore | None = None,
+        **given: Any,
     ) -> None:
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=PATH")
-        if store is None:
-            bare = BareFacts(intrinsics, unit_m, fps, dataset)
-            store = open_recording(path, camera_file, modulation_mhz, topic, bare)
-        self._recording = store
+        known = Given(**given)
+        self._recording = store = store or open_recording(path, known)
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
         if store.left_out:
@@ -80,13 +68,8 @@ class Replay(BaseDevice):
         self._round_s = float(self._times_s[-1] - self._times_s[0]) + 1 / store.fps
         """From a frame to the same one in the next round; the last one lasts one frame's time."""
         self._realtime, self._repeat = bool(realtime), bool(repeat)
-        if intrinsics is not None and camera_file is not None:
-            raise ToftrackError(
-                "camera.file and device.intrinsics both tell the lens; leave one out"
-            )
-        camera, size = store.camera, (store.camera.width, store.camera.height)
-        if camera_file is not None:
-            camera = Camera.load_for(camera_file, *size, f"'{path}'")
+        size = store.camera.width, store.camera.height
+        camera = known.camera(*size, f"'{path}'") or store.camera
         found = doubts(store, camera)
         for doubt in found:
             _log.warning("%s: %s", path, doubt)
@@ -106,7 +89,7 @@ class Replay(BaseDevice):
             "stop": rows.stop,
             "realtime": self._realtime,
             "repeat": self._repeat,
-            "camera_file": None if camera_file is None else str(camera_file),
+            "camera_file": None if known.camera_file is None else str(known.camera_file),
             "doubts": list(found),
         }
         if store.names:

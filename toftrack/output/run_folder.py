@@ -22,10 +22,9 @@ from toftrack.output.results import estimates_of, read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.files import make_pose_space
-from toftrack.recordings.bare import BareFacts
+from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import Recording
-from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import FIRST_SAMPLE, open_recording, open_sample
 from toftrack.render.likelihood import FMeasure
 from toftrack.render.segmentation import Expected, NearestSurface, Observation
@@ -278,13 +277,10 @@ def open_tracked(
             f"the recording '{path}' is not there{' any more' if recording is None else ''}; "
             "say where it is with --recording FILE"
         )
-    camera_file = about.get("camera_file")
-    modulation_mhz = device.get("modulation_mhz", DEFAULT_MODULATION_MHZ)
-    camera_path = None if camera_file is None else found_again(camera_file, ran_in)
-    bare = BareFacts(
-        device.get("intrinsics"), device.get("unit_m"), device.get("fps"), device.get("dataset")
-    )
-    return open_recording(path, camera_path, modulation_mhz, device.get("topic"), bare), path
+    given = {one.name: device[one.name] for one in fields(Given) if one.name in device}
+    file = about.get("camera_file")
+    given["camera_file"] = None if file is None else found_again(file, ran_in)
+    return open_recording(path, Given(**given)), path
 
 
 def _rows(

@@ -25,7 +25,7 @@ from toftrack.configuration.compose import (
 from toftrack.configuration.plugins import offer_installed
 from toftrack.errors import ToftrackError
 from toftrack.programs import command_line, shutdown
-from toftrack.recordings.bag_names import is_bag
+from toftrack.recordings.rosbag import is_bag
 
 _WITH_VALUE = frozenset(
     "--config-path -cp --config-name -cn --config-dir -cd --cfg -c --package -p "

@@ -26,9 +26,10 @@ from toftrack.frames import calibration
 from toftrack.frames.calibration import DepthFit, DepthPairs, Lens, View
 from toftrack.frames.camera import Camera
 from toftrack.programs.command_line import plain_parser
+from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
-from toftrack.recordings.store import open_recording
+from toftrack.recordings.store import open_with_own_camera
 from toftrack.views.figures import chart
 from toftrack.views.figures.chart import write_figures
 from toftrack.views.pictures import write_picture
@@ -72,10 +73,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ToftrackError(
             f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
         )
-    with closing(open_recording(options.recording, options.camera, options.modulation)) as store:
-        start = store.camera
-        if options.camera:
-            start = Camera.load_for(options.camera, start.width, start.height, "the recording")
+    given = Given(camera_file=options.camera, modulation_mhz=options.modulation)
+    with closing(open_with_own_camera(options.recording, given)) as store:
+        size = store.camera.width, store.camera.height
+        start = given.camera(*size, "the recording") or store.camera
         result = _calibrate(store, board, square_m, start, options.keep_lens, options.frames)
     out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")

@@ -20,9 +20,8 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import whole_file
-from toftrack.frames.camera import Camera
 from toftrack.programs.command_line import Parser
-from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.image_folder import PngFolderWriter
 from toftrack.recordings.npz import write_recording
@@ -59,21 +58,21 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--dataset", help="the depth stack in a .h5 or .mat that has several")
     options = parser.parse_args(arguments)
     lens = None if options.intrinsics is None else tuple(options.intrinsics)
-    read = options.camera, options.modulation, options.unit, options.overwrite, options.topic
-    bare = BareFacts(lens, options.source_unit, options.fps, options.dataset)
-    count = convert(options.source, options.target, *read, bare)
+    given = Given(
+        *(lens, options.source_unit, options.fps, options.dataset),
+        *(options.camera, options.topic, options.modulation),
+    )
+    written = options.unit, options.overwrite
+    count = convert(options.source, options.target, given, *written)
     print(f"{options.target}: {count} frames")
 
 
 def convert(
     source: str | Path,
     target: str | Path,
-    camera_file: str | Path | None = None,
-    modulation_mhz: int = DEFAULT_MODULATION_MHZ,
+    given: Given = NOTHING_GIVEN,
     unit_m: float | None = None,
     overwrite: bool = False,
-    topic: str | None = None,
-    bare: BareFacts = NOTHING_GIVEN,
 ) -> int:
     """Convert a recording, frame by frame; returns the number of frames.
 
@@ -97,13 +96,7 @@ def convert(
         raise ToftrackError(
             f"the file '{target}' exists already; choose another name or give --overwrite"
         )
-    if camera_file is not None and bare.intrinsics is not None:
-        raise ToftrackError("--camera and --intrinsics both tell the lens; leave one out")
-    opened = open_recording(source, camera_file, modulation_mhz, topic, bare)
-    with closing(opened) as store:
-        if camera_file is not None:
-            size = store.camera.width, store.camera.height
-            store.camera = Camera.load_for(camera_file, *size, "the recording")
+    with closing(open_recording(source, given)) as store:
         if store.truth is not None and kind != ".npz":
             _warn("the ground truth has no place in the new format and is left out")
         if damage := store.damage:
@@ -114,7 +107,7 @@ def convert(
             if kind == ".npz":
                 write_recording(target, store, bar.update)
             elif kind == ".srs":
-                _to_srs(store, target, unambiguous_range_m(modulation_mhz), bar)
+                _to_srs(store, target, unambiguous_range_m(given.modulation_mhz), bar)
             else:
                 _to_folder(store, target, unit_m, bar)
         return len(store)

@@ -1,4 +1,4 @@
-"""Images that say nothing of lens, unit and frame rate: what is given instead."""
+"""What is given of a recording that does not say it: lens, unit, frame rate, and so on."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import LARGEST_MEDIAN_M, median_reading
+from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 
 MILLIMETRE = 0.001
 MOST = 1e6
@@ -20,7 +21,7 @@ _BESIDE = "camera.json"
 
 
 @dataclass(frozen=True)
-class BareFacts:
+class Given:
     """None = not given; ToftrackError for what cannot be meant."""
 
     intrinsics: Sequence[float] | None = None
@@ -30,6 +31,11 @@ class BareFacts:
     fps: float | None = None
     dataset: str | None = None
     """The name of the depth stack in a file that may hold several."""
+    camera_file: str | Path | None = None
+    topic: str | None = None
+    """Of the depth images in a ROS bag that has several of them."""
+    modulation_mhz: int = DEFAULT_MODULATION_MHZ
+    """Tells the range of a `.srs` that does not state it."""
 
     def __post_init__(self) -> None:
         for name in ("unit_m", "fps"):
@@ -40,9 +46,18 @@ class BareFacts:
                 "intrinsics must be four numbers of pixels, fx, fy (above 0), cx, cy, as "
                 f"[504.6,504.7,332.8,348.8], but are {self.intrinsics}"
             )
+        if self.intrinsics is not None and self.camera_file is not None:
+            raise ToftrackError(
+                "camera.file and device.intrinsics (toftrack convert: --camera and --intrinsics) "
+                "both tell the lens; leave one out"
+            )
 
-    def camera(self, width: int, height: int) -> Camera | None:
-        """The camera of the intrinsics for images of that size; None when they are not given."""
+    def camera(self, width: int, height: int, images: str) -> Camera | None:
+        """The camera for images of that size, which are called so in errors; None: none is given.
+        ToftrackError where it is of another size.
+        """
+        if self.camera_file is not None:
+            return Camera.load_for(self.camera_file, width, height, images)
         if self.intrinsics is None:
             return None
         fx, fy, cx, cy = self.intrinsics
@@ -56,21 +71,17 @@ def _four_numbers(values: object) -> bool:
     return numbers and all(map(math.isfinite, values)) and min(values[0], values[1]) > 0
 
 
-NOTHING_GIVEN = BareFacts()
+NOTHING_GIVEN = Given()
 
 
-def bare_camera(
-    path: Path, camera_file: str | Path | None, bare: BareFacts, width: int, height: int
-) -> Camera:
+def bare_camera(path: Path, given: Given, width: int, height: int) -> Camera:
     """The camera of a file of bare images of that size: as given, else camera.json beside it;
     ToftrackError where there is none, or it is of another size.
     """
-    if camera_file is None and (given := bare.camera(width, height)):
-        return given
-    beside = path.parent / _BESIDE
-    if camera_file is not None or beside.exists():
-        file = beside if camera_file is None else camera_file
-        return Camera.load_for(file, width, height, f"'{path}'")
+    if camera := given.camera(width, height, f"'{path}'"):
+        return camera
+    if (beside := path.parent / _BESIDE).exists():
+        return Camera.load_for(beside, width, height, f"'{path}'")
     raise ToftrackError(
         f"'{path}' ({width}x{height} pixels) does not say what camera made it; give the lens with "
         "device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY), or a camera "
@@ -78,13 +89,22 @@ def bare_camera(
     )
 
 
-def size_of(path: Path, camera_file: str | Path | None, bare: BareFacts) -> np.ndarray | None:
+def size_of(path: Path, given: Given) -> np.ndarray | None:
     """Width and height of the images, as far as the camera that is given, or lies beside, tells."""
+    if given.intrinsics is not None:
+        return 2 * np.array(given.intrinsics[2:]) + 1
     beside = path.parent / _BESIDE
-    if camera_file is not None or bare.intrinsics is None and beside.exists():
-        camera = Camera.load(camera_file or beside)
-        return np.array((camera.width, camera.height))
-    return None if bare.intrinsics is None else 2 * np.array(bare.intrinsics[2:]) + 1
+    if given.camera_file is None and not beside.exists():
+        return None
+    camera = Camera.load(given.camera_file or beside)
+    return np.array((camera.width, camera.height))
+
+
+def metres_of(words: np.ndarray, unit_m: float) -> np.ndarray:
+    """Readings as float32 metres, a new array, 0 where there are none; unit_m: metres of a step."""
+    with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading
+        depth = words.astype(np.float32) * np.float32(unit_m)
+    return np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
 
 
 def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:

@@ -35,7 +35,14 @@ from toftrack.files.archives import MOST_TEXT_BYTES, broken_is_value_error
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_new, open_to_read, write_whole
 from toftrack.frames.camera import Camera
-from toftrack.recordings.bare import MILLIMETRE, MOST, NOTHING_GIVEN, BareFacts, check_metres
+from toftrack.recordings.bare import (
+    MILLIMETRE,
+    MOST,
+    NOTHING_GIVEN,
+    Given,
+    check_metres,
+    metres_of,
+)
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of
 from toftrack.recordings.images import decoded_depth, pages_of
 
@@ -125,43 +132,51 @@ class ZippedFiles(Files):
 
 
 class ImageFolder(FrameStore):
-    """The frames of a folder, read from the disk one at a time. Raises ToftrackError where
-    `stated`, the content of the folder's `camera.json`, makes no sense.
+    """The frames of a folder of depth images, or of a `.zip`, read from the disk one at a time: the
+    first image is checked when it is opened.
+
+    given: goes before what `camera.json` says; the unit is else 0.001 (of floats 1), fps 25. Raises
+    ToftrackError: there is no depth image or camera, `camera.json` makes no sense, or the first
+    image is damaged, or of another size than the camera's; later, another one.
     """
 
     unit_m: float
 
-    def __init__(
-        self,
-        files: Files,
-        depth: list[str],
-        amplitude: list[str],
-        camera: Camera,
-        stated: dict[str, Any],
-        bare: BareFacts,
-        first: np.ndarray,
-    ) -> None:
-        self.camera, path = camera, f"{_CAMERA} of {files.what}"
-        self._files, self._depth, self._amplitude, self._kind = files, depth, amplitude, first.dtype
+    def __init__(self, folder: Path, given: Given = NOTHING_GIVEN) -> None:
+        zipped = folder.suffix.lower() == ".zip" and not folder.is_dir()
+        files = self._files = ZippedFiles(file_of(folder)) if zipped else Files(folder)
+        self._depth, self._amplitude, self.left_out = _sorted_out(files)
+        count, amplitudes = len(self._depth), len(self._amplitude)
+        if amplitudes not in (0, count):
+            raise ToftrackError(
+                f"{files.what} has {count} depth and {amplitudes} amplitude images; there must be "
+                "as many of both, or no amplitude"
+            )
+        first = _decoded(files, self._depth[0])
+        self._kind, whole = first.dtype, first.dtype == np.uint16
+        self.camera, stated = _camera(files, self._depth[0], first, given)
+        path = f"{_CAMERA} of {files.what}"
         self.radial, self.metadata = stated.get("radial", False), stated.get("metadata", {})
         if not isinstance(self.radial, bool) or not isinstance(self.metadata, dict):
             raise ToftrackError(f"in {path}, radial must be true or false, and metadata an object")
-        whole = first.dtype == np.uint16
-        unit_m = bare.unit_m or stated.get("depth_unit_m", MILLIMETRE if whole else 1.0)
-        fps = bare.fps or stated.get("fps", DEFAULT_FPS)
+        unit_m = given.unit_m or stated.get("depth_unit_m", MILLIMETRE if whole else 1.0)
+        fps = given.fps or stated.get("fps", DEFAULT_FPS)
         for name, value in (("depth_unit_m", unit_m), ("fps", fps)):
             check_number(name, value, 0, MOST, above=True, remedy=f" ({path})")
         self.unit_m, self.fps = float(unit_m), float(fps)
-        times_s = _timestamps(files, depth)
-        self.timestamp_s = np.arange(len(depth)) / self.fps if times_s is None else times_s
-        self.names = tuple(depth)
+        times_s = _timestamps(files, self._depth)
+        self.timestamp_s = np.arange(count) / self.fps if times_s is None else times_s
+        self.names = tuple(self._depth)
+        if not whole:
+            remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
+            what = f"the image '{self._depth[0]}' in {files.what}"
+            check_metres(metres_of(first, self.unit_m), what, remedy)
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
-        depth = self._read(self._depth[index], self._kind).astype(np.float32)
-        depth *= np.float32(self.unit_m)
-        depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
-        amplitude = self._amplitude and self._read(self._amplitude[index], np.dtype(np.uint16))
-        return depth, amplitude if isinstance(amplitude, np.ndarray) else None
+        depth = metres_of(self._read(self._depth[index], self._kind), self.unit_m)
+        if not self._amplitude:
+            return depth, None
+        return depth, self._read(self._amplitude[index], np.dtype(np.uint16))
 
     def close(self) -> None:
         self._files.close()
@@ -175,62 +190,6 @@ class ImageFolder(FrameStore):
                 "like the others"
             )
         return image
-
-
-def read_image_folder(
-    folder: str | Path,
-    camera_file: str | Path | None = None,
-    bare: BareFacts = NOTHING_GIVEN,
-) -> ImageFolder:
-    """Open a folder of depth images, or a `.zip`: the first image is checked, the others stay where
-    they are.
-
-    camera_file: instead of the folder's `camera.json`.  bare: what is given goes before what
-    `camera.json` says; the unit is else 0.001 (of floats 1), fps 25. Raises ToftrackError: there is
-    no depth image or camera, or the first image is damaged, or of another size than the camera's;
-    later, another one.
-    """
-    folder = Path(os.path.expanduser(folder))
-    zipped = folder.suffix.lower() == ".zip" and not folder.is_dir()
-    files = ZippedFiles(file_of(folder)) if zipped else Files(folder)
-    depth, amplitude, left_out = _sorted_out(files)
-    if amplitude and len(amplitude) != len(depth):
-        raise ToftrackError(
-            f"{files.what} has {len(depth)} depth and {len(amplitude)} amplitude images; "
-            "there must be as many of both, or no amplitude"
-        )
-    first = _decoded(files, depth[0])
-    height, width = first.shape
-    content, found = {}, _beside(files, depth[0], _CAMERA)
-    if found is not None:
-        what = f"the camera file '{found}' in {files.what} cannot be read"
-        with reported_errors(what, "write it anew (docs/formats.md)", ValueError):
-            content = parse_json(files.text(found))
-        if not isinstance(content, dict):
-            raise ToftrackError(f"'{found}' in {files.what} is not a camera file")
-    if camera_file is not None:
-        camera = Camera.load(camera_file)
-    elif configured := bare.camera(width, height):
-        camera = configured
-    elif found is not None:
-        camera = Camera.from_dict(content, folder / found)
-    else:
-        raise ToftrackError(
-            f"{files.what} has no {_CAMERA}; put the camera's file there (docs/formats.md "
-            "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
-            "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
-        )
-    if (width, height) != (camera.width, camera.height):
-        raise ToftrackError(
-            f"the image '{depth[0]}' in {files.what} has {width}x{height} pixels, but the camera "
-            f"has {camera.width}x{camera.height}; give the camera of these images"
-        )
-    store = ImageFolder(files, depth, amplitude, camera, content, bare, first)
-    store.left_out = left_out
-    if first.dtype != np.uint16:
-        remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
-        check_metres(store.image(0)[0], f"the image '{depth[0]}' in {files.what}", remedy)
-    return store
 
 
 def _is_image(name: str) -> bool:
@@ -283,6 +242,35 @@ def _surely_no_depth(files: Files, name: str) -> bool:
     except (OSError, ValueError):
         return False
     return bool(pages) and not pages[0].is_depth
+
+
+def _camera(
+    files: Files, image: str, first: np.ndarray, given: Given
+) -> tuple[Camera, dict[str, Any]]:
+    """The camera of the images, whose first one has that name; and what camera.json says."""
+    height, width = first.shape
+    content: Any = {}
+    if found := _beside(files, image, _CAMERA):
+        what = f"the camera file '{found}' in {files.what} cannot be read"
+        with reported_errors(what, "write it anew (docs/formats.md)", ValueError):
+            content = parse_json(files.text(found))
+        if not isinstance(content, dict):
+            raise ToftrackError(f"'{found}' in {files.what} is not a camera file")
+    if lens := given.camera(width, height, f"the image '{image}' in {files.what}"):
+        return lens, content
+    if not found:
+        raise ToftrackError(
+            f"{files.what} has no {_CAMERA}; put the camera's file there (docs/formats.md "
+            "has an example), or give another with camera.file=FILE (toftrack convert: --camera "
+            "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
+        )
+    camera = Camera.from_dict(content, files.path / found)
+    if (width, height) != (camera.width, camera.height):
+        raise ToftrackError(
+            f"the image '{image}' in {files.what} has {width}x{height} pixels, but the camera "
+            f"has {camera.width}x{camera.height}; give the camera of these images"
+        )
+    return camera, content
 
 
 def _decoded(files: Files, name: str) -> np.ndarray:

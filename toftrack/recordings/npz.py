@@ -42,7 +42,7 @@ from toftrack.frames.frame import (
     median_reading,
     wrong_unit,
 )
-from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 
 LOADED_BYTES = MOST_BYTES
@@ -152,13 +152,11 @@ class Recording(FrameStore):
                 images.close()
 
 
-def read_recording(
-    path: str | Path, camera_file: str | Path | None = None, bare: BareFacts = NOTHING_GIVEN
-) -> Recording:
+def read_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> Recording:
     """Read and check a recording. ToftrackError, one sentence that names the file, when it is
     missing, damaged, contains pickled objects or breaks the format above.
 
-    camera_file, bare: its camera, and its frame rate, where it says nothing of them.
+    given: its camera, and its frame rate, where it says nothing of them.
     """
     path = file_of(path)
     try:
@@ -174,7 +172,7 @@ def read_recording(
             f"the recording '{path}' is damaged ({error}); copy or record it again"
         ) from error
     try:
-        return _parse(arrays, camera_file, bare)
+        return _parse(arrays, given)
     except ToftrackError as error:
         raise ToftrackError(f"the recording '{path}' cannot be used: {error}") from None
 
@@ -240,13 +238,13 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
     }
 
 
-def _parse(arrays: dict[str, Any], camera_file: str | Path | None, bare: BareFacts) -> Recording:
+def _parse(arrays: dict[str, Any], given: Given) -> Recording:
     depth_key = "depth_m" if "depth_m" in arrays else "radial_m"
     depth = _check_depth(arrays[depth_key], depth_key)
     _check_layout(depth.shape, arrays, depth_key)
     count, height, width = depth.shape
-    camera = _camera_of(arrays, width, height, camera_file, bare)
-    timestamp_s, fps = _times(arrays, count, bare.fps)
+    camera = _camera_of(arrays, width, height, given)
+    timestamp_s, fps = _times(arrays, count, given.fps)
     metadata = _metadata(arrays)
     return Recording(
         depth=depth,
@@ -357,29 +355,21 @@ def camera_arrays(camera: Camera) -> dict[str, np.ndarray]:
     return {key: np.array(content[key]) for key in _CAMERA if content.get(key)}
 
 
-def _camera_of(
-    arrays: dict[str, Any],
-    width: int,
-    height: int,
-    camera_file: str | Path | None,
-    bare: BareFacts,
-) -> Camera:
+def _camera_of(arrays: dict[str, Any], width: int, height: int, given: Given) -> Camera:
     """The camera of images of that size, px: the file's, else the given one. ToftrackError."""
     if "K" not in arrays:
-        if camera_file is not None:
-            return Camera.load_for(camera_file, width, height, "the recording")
-        if lens := bare.camera(width, height):
+        if lens := given.camera(width, height, "the recording"):
             return lens
         raise ToftrackError(
             "the required key 'K' (3x3 camera matrix, pixels) is missing; add it, or give the lens "
             "with device.intrinsics=[FX,FY,CX,CY] (toftrack convert: --intrinsics FX FY CX CY)"
         )
-    given: dict[str, Any] = {key: arrays[key] for key in _CAMERA if key in arrays}
-    if "lens" in given:
-        if given["lens"].size != 1 or given["lens"].dtype.kind != "U":
+    own: dict[str, Any] = {key: arrays[key] for key in _CAMERA if key in arrays}
+    if "lens" in own:
+        if own["lens"].size != 1 or own["lens"].dtype.kind != "U":
             raise ToftrackError("'lens' must be one text, opencv or fisheye")
-        given["lens"] = given["lens"].item()
-    return Camera(width=width, height=height, **given)
+        own["lens"] = own["lens"].item()
+    return Camera(width=width, height=height, **own)
 
 
 def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:

@@ -15,6 +15,7 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
+from toftrack.recordings.bare import metres_of
 from toftrack.recordings.images import LARGEST_PIXELS, SIGNATURE, decoded_png
 
 IMAGE = "sensor_msgs/msg/Image"
@@ -44,9 +45,7 @@ def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
     which begins with "it", where its pixels are of another kind, or damaged.
     """
     words = _pixels(message) if kind == IMAGE else _decompressed(message)
-    if words.dtype.kind == "u":
-        return words.astype(np.float32) * np.float32(unit_m)
-    return np.where((words > 0) & (words < np.inf), words, 0).astype(np.float32)
+    return metres_of(words, unit_m if words.dtype.kind == "u" else 1.0)
 
 
 def _pixels(message: Any) -> np.ndarray:

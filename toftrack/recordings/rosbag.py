@@ -10,7 +10,7 @@ from __future__ import annotations
 import importlib
 import os
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -21,8 +21,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import check_readable
 from toftrack.frames.camera import Camera
-from toftrack.recordings.bag_names import storage_of
-from toftrack.recordings.bare import MILLIMETRE, BareFacts, check_metres
+from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, Given, check_metres
 from toftrack.recordings.frame_store import FrameStore, rate_of
 from toftrack.recordings.ros_messages import (
     CAMERA_INFO,
@@ -34,6 +33,8 @@ from toftrack.recordings.ros_messages import (
     is_depth,
 )
 
+_SUFFIXES = (".bag", ".mcap", ".db3")
+_METADATA = "metadata.yaml"
 _REPAIR = {
     ".bag": "rosbag reindex FILE repairs a bag that was cut off",
     ".mcap": "mcap recover FILE repairs one that was cut off",
@@ -47,19 +48,57 @@ _OF_CAMERAS = {"/device_0/sensor_": "realsense", "/cam/sensor_": "orbbec"}
 """How topics begin in the bags that cameras' own programs write, and the devices that play them."""
 
 
+def is_bag(path: str | Path) -> bool:
+    """A file `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), or a folder with such files."""
+    if os.path.isdir(path):
+        return os.path.exists(os.path.join(path, _METADATA)) or bool(_storages(Path(path)))
+    return os.path.splitext(path)[1].lower() in _SUFFIXES
+
+
+def _storages(folder: Path) -> list[Path]:
+    """The files with messages of a ROS 2 bag's folder; none where it cannot be read."""
+    try:
+        return sorted(path for path in folder.iterdir() if path.suffix in _SUFFIXES[1:])
+    except OSError:
+        return []
+
+
 class RosBag(FrameStore):
-    """The depth images of one topic, from the disk one at a time. Made by `read_rosbag`."""
+    """The depth images of one topic, from the disk one at a time; its times are read at once.
+
+    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  given: a lens instead of the
+    bag's camera_info; the topic of the depth images, None = the only one there is; metres of one
+    step of 16UC1, None = a millimetre, as ROS says. Raises ToftrackError: rosbags is not installed,
+    the bag is damaged, it has no depth images or several topics of them, or nothing tells their
+    lens; one sentence.
+    """
 
     unit_m: float
 
-    def __init__(self, bag: _Bag, topic: _Topic, camera: Camera, unit_m: float) -> None:
-        self.path, self.camera, self.unit_m = bag.path, camera, unit_m
-        self.timestamp_s, self._recorded_ns, self.damage = _times(bag, topic)
-        self.fps = rate_of(self.timestamp_s)
-        self.metadata = {"topic": topic.name, "encoding": topic.encoding}
-        self._bag, self._topic = bag, topic
+    def __init__(self, path: Path, given: Given = NOTHING_GIVEN) -> None:
+        if not path.exists():
+            raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
+        with reported_errors(f"the bag '{path}' cannot be read", "give the path of a recording"):
+            check_readable(path)
+        self.path, self.unit_m = path, given.unit_m or MILLIMETRE
+        bag = self._bag = _Bag(path)
         self._messages: Iterator[tuple[int, Any]] | None = None
         self._next = 0
+        with closing(bag):
+            topic = self._topic = _choose(bag, given.topic)
+            first = _image(path, topic, topic.first, self.unit_m, 0)
+            what = f"the first image of {topic.name} in '{path}'"
+            check_metres(first, what, _OTHER_UNIT)
+            height, width = first.shape
+            self.camera = given.camera(width, height, what) or _camera(bag, topic)
+            if first.shape != (self.camera.height, self.camera.width):
+                raise ToftrackError(  # its lens would take that much memory
+                    f"{what} has {width}x{height} pixels, but its camera {self.camera.width}x"
+                    f"{self.camera.height}; give the right one with camera.file=FILE"
+                )
+            self.timestamp_s, self._recorded_ns, self.damage = _times(bag, topic)
+        self.fps = rate_of(self.timestamp_s)
+        self.metadata = {"topic": topic.name, "encoding": topic.encoding}
 
     def image(self, index: int) -> tuple[np.ndarray, None]:
         if self._messages is None or index != self._next:
@@ -89,43 +128,6 @@ class RosBag(FrameStore):
         before = index - int(np.searchsorted(self._recorded_ns, start_ns))
         for _ in islice(self._messages, before):
             pass
-
-
-def read_rosbag(
-    path: str | Path,
-    topic: str | None = None,
-    camera_file: str | Path | None = None,
-    unit_m: float | None = None,
-) -> RosBag:
-    """Open a bag and read its times.
-
-    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  topic: of the depth images;
-    None = the only one there is.  camera_file: instead of the bag's camera_info.  unit_m: metres of
-    one step of 16UC1; None = a millimetre, as ROS says. Raises ToftrackError: rosbags is not
-    installed, the bag is damaged, it has no depth images or several topics of them, or nothing
-    tells their lens; one sentence.
-    """
-    path = Path(os.path.expanduser(path))
-    if not path.exists():
-        raise ToftrackError(f"there is no bag '{path}'; give the path of a recording")
-    unit_m = BareFacts(unit_m=unit_m).unit_m or MILLIMETRE
-    with reported_errors(f"the bag '{path}' cannot be read", "give the path of a recording"):
-        check_readable(path)
-    bag = _Bag(path)
-    try:
-        chosen = _choose(bag, topic)
-        camera = _camera(bag, chosen) if camera_file is None else Camera.load(camera_file)
-        first = _image(path, chosen, chosen.first, unit_m, 0)
-        what = f"the first image of {chosen.name} in '{path}'"
-        check_metres(first, what, _OTHER_UNIT)
-        if first.shape != (camera.height, camera.width):  # its lens would take that much memory
-            raise ToftrackError(
-                f"{what} has {first.shape[1]}x{first.shape[0]} pixels, but its camera"
-                f" {camera.width}x{camera.height}; give the right one with camera.file=FILE"
-            )
-        return RosBag(bag, chosen, camera, unit_m)
-    finally:
-        bag.close()
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,8 +168,12 @@ class _Bag:
 
     def reader(self) -> Any:
         if self._reader is None:
+            path = self.path
+            # A folder whose metadata was never written is its only file.
+            if path.is_dir() and not (path / _METADATA).exists() and len(_storages(path)) == 1:
+                (path,) = _storages(path)
             with self._reported():
-                reader = self._rosbags.Reader(storage_of(self.path))
+                reader = self._rosbags.Reader(path)
                 reader.open()
             self._reader = reader
         return self._reader

@@ -179,11 +179,25 @@ class SrsWriter:
 
 
 class SrsRecording(FrameStore):
-    """The frames of a `.srs` file, read from the disk one at a time."""
+    """The frames of a `.srs` file, read from the disk one at a time; its objects are checked when
+    it is opened. One that is cut off or damaged somewhere is usable up to there (`damage` says so).
+
+    modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
+    registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
+    file, of another version, in a wrong order or without any whole frame.
+    """
 
     radial = True
 
-    def __init__(self, path: Path, scan: _Scan, default_range_m: float) -> None:
+    def __init__(self, path: Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> None:
+        path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
+        with reading(path), open_to_read(path) as stream:
+            scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
+        if not scan.offsets:
+            reason = f" ({scan.damage})" if scan.damage else ""
+            raise ToftrackError(
+                f"the recording '{path}' has no whole frame{reason}; record it again"
+            )
         facts, stamps = scan.facts, np.array(scan.stamps, np.float64)
         usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
         self.path, self.camera = path, facts.camera or nominal_camera()
@@ -215,24 +229,6 @@ class SrsRecording(FrameStore):
         if self._stream is not None:
             self._stream.close()
             self._stream = None
-
-
-def read_srs(path: str | Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> SrsRecording:
-    """Open a `.srs` recording: its objects are checked, its frames stay on the disk.
-
-    A file that is cut off or damaged somewhere is usable up to there (`damage` says so).
-
-    modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
-    registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
-    file, of another version, in a wrong order or without any whole frame.
-    """
-    path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
-    with reading(path), open_to_read(path) as stream:
-        scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
-    if not scan.offsets:
-        reason = f" ({scan.damage})" if scan.damage else ""
-        raise ToftrackError(f"the recording '{path}' has no whole frame{reason}; record it again")
-    return SrsRecording(path, scan, default_range_m)
 
 
 @dataclass

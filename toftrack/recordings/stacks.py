@@ -18,7 +18,14 @@ import numpy as np
 from toftrack.errors import ToftrackError, module_of_extra, reported_errors
 from toftrack.files.archives import MOST_BYTES
 from toftrack.files.safe_files import open_to_read
-from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera, check_metres, size_of
+from toftrack.recordings.bare import (
+    MILLIMETRE,
+    Given,
+    bare_camera,
+    check_metres,
+    metres_of,
+    size_of,
+)
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
 from toftrack.recordings.images import pages_of
 from toftrack.recordings.matlab import matlab_variables, read_matlab
@@ -34,21 +41,39 @@ _MOST_RATIO, _SMALL_BYTES, _MOST_CHUNK_BYTES = 1000, 2**26, 2**28
 
 
 class Stack(FrameStore):
-    """The frames of a stack, from the disk as long as this object lives. Made by `read_stack`.
+    """The frames of a stack, from the disk as long as this object lives; its kind follows from its
+    name.
 
-    images: three axes of numbers.  order: which of them are frames, rows and columns.
+    given: a lens, or camera.json lies beside the file; the unit of whole numbers (a millimetre) and
+    the frame rate (25); of a `.h5` or `.mat` that has several, the dataset. Raises ToftrackError:
+    it is no such stack, damaged, holds pickled objects, or nothing tells its camera.
     """
 
-    def __init__(
-        self, path: Path, images: Any, order: tuple[int, ...], camera_file: Any, bare: BareFacts
-    ) -> None:
+    unit_m: float
+
+    def __init__(self, path: Path, given: Given) -> None:
+        self.path = file_of(path)
+        images, order = _OPENED[path.suffix.lower()](path, given.dataset)
+        if len(images.shape) != 3 or 0 in images.shape or images.dtype.kind not in "uif":
+            raise ToftrackError(
+                f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth "
+                "images, (frames, rows, columns) of numbers"
+            )
+        size = None if images.shape[0] == 1 else size_of(path, given)
+        if size is not None and path.suffix.lower() in DATASETS:
+
+            def misfit(order: tuple[int, ...]) -> float:
+                height, width = (images.shape[axis] for axis in order[1:])
+                return float(np.abs(np.log((width, height) / size)).sum())
+
+            order = min(order, _PYTHONS, _MATLABS, _REVERSED, key=misfit)
         count, height, width = (images.shape[axis] for axis in order)
-        self.camera = bare_camera(path, camera_file, bare, width, height)
-        self.unit_m = bare.unit_m or (MILLIMETRE if images.dtype.kind in "ui" else 1.0)
-        self.fps = bare.fps or DEFAULT_FPS
+        self.camera = bare_camera(path, given, width, height)
+        self.unit_m = given.unit_m or (MILLIMETRE if images.dtype.kind in "ui" else 1.0)
+        self.fps = given.fps or DEFAULT_FPS
         self.timestamp_s = np.arange(count) / self.fps
-        self.metadata = {} if bare.dataset is None else {"dataset": bare.dataset}
-        self.path, self._images, self._order = path, images, order
+        self.metadata = {} if given.dataset is None else {"dataset": given.dataset}
+        self._images, self._order = images, order
         some = [self.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
         remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
         check_metres(np.stack(some), f"'{path}'", remedy)
@@ -58,40 +83,12 @@ class Stack(FrameStore):
         at[self._order[0]] = index
         with _reported(self.path, f"frame {index} of "):
             image = np.asarray(self._images[tuple(at)])
-        with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading
-            depth = image.astype(np.float32) * np.float32(self.unit_m)
-        depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
+        depth = metres_of(image, self.unit_m)
         return (depth.T.copy() if self._order[1] > self._order[2] else depth), None
 
     def close(self) -> None:
         if isinstance(self._images, _Hdf5):
             self._images.close()
-
-
-def read_stack(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> Stack:
-    """Open a stack, whose kind follows from its name.
-
-    camera_file: None = the given intrinsics, or camera.json beside the file.  bare: intrinsics,
-    unit of whole numbers (a millimetre) and frame rate (25) where given, and the name of the
-    dataset in a `.h5` or `.mat` that has several. Raises ToftrackError: it is no such stack,
-    damaged, holds pickled objects, or nothing tells its camera.
-    """
-    path = file_of(path)
-    images, order = _OPENED[path.suffix.lower()](path, bare.dataset)
-    if len(images.shape) != 3 or 0 in images.shape or images.dtype.kind not in "uif":
-        raise ToftrackError(
-            f"'{path}' has the shape {images.shape} of {images.dtype}, but must be depth images, "
-            "(frames, rows, columns) of numbers"
-        )
-    size = None if images.shape[0] == 1 else size_of(path, camera_file, bare)
-    if size is not None and path.suffix.lower() in DATASETS:
-
-        def misfit(order: tuple[int, ...]) -> float:
-            height, width = (images.shape[axis] for axis in order[1:])
-            return float(np.abs(np.log((width, height) / size)).sum())
-
-        order = min(order, _PYTHONS, _MATLABS, _REVERSED, key=misfit)
-    return Stack(path, images, order, camera_file, bare)
 
 
 @contextmanager

@@ -11,16 +11,14 @@ from pathlib import Path
 from toftrack.configuration.plugins import installed, named_object
 from toftrack.errors import ToftrackError
 from toftrack.files.safe_files import open_to_read
-from toftrack.recordings.bag_names import is_bag
-from toftrack.recordings.bare import NOTHING_GIVEN, BareFacts
+from toftrack.recordings.bare import NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import FrameStore, file_of, reading
-from toftrack.recordings.image_folder import read_image_folder
+from toftrack.recordings.image_folder import ImageFolder
 from toftrack.recordings.npz import read_recording
-from toftrack.recordings.rosbag import read_rosbag
-from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
-from toftrack.recordings.srs import read_srs
-from toftrack.recordings.stacks import DATASETS, STACKS, read_stack
-from toftrack.recordings.video import VIDEOS, read_video
+from toftrack.recordings.rosbag import RosBag, is_bag
+from toftrack.recordings.srs import SrsRecording
+from toftrack.recordings.stacks import DATASETS, STACKS, Stack
+from toftrack.recordings.video import VIDEOS, DepthVideo
 
 _BY_OPENNI = (
     "write its depth out as 16-bit PNG images by OpenNI, put a camera.json beside them "
@@ -63,60 +61,52 @@ ELSEWHERE = {
 _READ = "a folder of images, .npz, .zip, .npy, .tif, .h5, .mat, .mkv, .avi, .bag, .mcap, .db3, .srs"
 
 
-def open_recording(
-    path: str | Path,
-    camera_file: str | Path | None = None,
-    modulation_mhz: int = DEFAULT_MODULATION_MHZ,
-    topic: str | None = None,
-    bare: BareFacts = NOTHING_GIVEN,
-) -> FrameStore:
-    """Open a recording, whose kind follows from its name. Only `.npz` is loaded as a whole.
+def open_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> FrameStore:
+    """Open a recording, whose kind follows from its name, with the camera that is given, or its
+    own. Only `.npz` is loaded as a whole.
 
     path: `.npz`, `.srs`, a folder or `.zip` of images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder
     with metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), a stack (`.npy`, `.tif`,
-    `.h5`, `.mat`), or of a suffix that an installed package reads (docs/extending.md).
-    camera_file, bare: of what has no camera of its own, and says nothing of itself.
-    modulation_mhz: tells the range of a `.srs` that does not state it.  topic: of a ROS bag that
-    has several of depth images. Raises ToftrackError: it cannot be used, or it says itself what is
-    given; one sentence that names it. A lens that is given goes before its own.
+    `.h5`, `.mat`), or of a suffix that an installed package reads (docs/extending.md). Raises
+    ToftrackError: it cannot be used, or it says itself what is given; one sentence that names it.
     """
-    store = _opened(path, camera_file, modulation_mhz, topic, bare)
-    given = ("unit_m", "--source-unit", store.unit_m), ("fps", "--fps", store.fps)
-    for name, option, own in given:
-        if getattr(bare, name) not in (None, own):
-            raise ToftrackError(
-                f"'{path}' says its {name} itself; leave device.{name} (convert: {option}) out"
-            )
-    if lens := bare.camera(store.camera.width, store.camera.height):
-        store.camera = lens
+    store = open_with_own_camera(path, given)
+    size = store.camera.width, store.camera.height
+    store.camera = given.camera(*size, f"'{path}'") or store.camera
     return store
 
 
-def _opened(
-    path: str | Path,
-    camera_file: str | Path | None,
-    modulation_mhz: int,
-    topic: str | None,
-    bare: BareFacts,
-) -> FrameStore:
+def open_with_own_camera(path: str | Path, given: Given = NOTHING_GIVEN) -> FrameStore:
+    """As `open_recording`, but the camera that is given does not go before its own."""
+    store = _opened(path, given)
+    told = ("unit_m", "--source-unit", store.unit_m), ("fps", "--fps", store.fps)
+    for name, option, own in told:
+        if getattr(given, name) not in (None, own):
+            raise ToftrackError(
+                f"'{path}' says its {name} itself; leave device.{name} (convert: {option}) out"
+            )
+    return store
+
+
+def _opened(path: str | Path, given: Given) -> FrameStore:
     path = Path(os.path.expanduser(path))
     suffix = path.suffix.lower()
     with reading(path):  # too long a name
         is_folder = path.is_dir()
     if is_bag(path):
-        return read_rosbag(path, topic, camera_file, bare.unit_m)
-    if topic is not None:
-        raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {topic}; leave it out")
-    if bare.dataset is not None and suffix not in DATASETS:
-        raise ToftrackError(f"'{path}' has no dataset {bare.dataset}; leave device.dataset out")
+        return RosBag(path, given)
+    if given.topic is not None:
+        raise ToftrackError(f"'{path}' is no ROS bag, and has no topic {given.topic}; leave it out")
+    if given.dataset is not None and suffix not in DATASETS:
+        raise ToftrackError(f"'{path}' has no dataset {given.dataset}; leave device.dataset out")
     if is_folder or suffix == ".zip":
-        return read_image_folder(path, camera_file, bare)
+        return ImageFolder(path, given)
     if suffix == ".srs":
-        return read_srs(path, modulation_mhz)
+        return SrsRecording(path, given.modulation_mhz)
     if suffix in STACKS:
-        return read_stack(path, camera_file, bare)
+        return Stack(path, given)
     if suffix in VIDEOS:
-        return read_video(path, camera_file, bare)
+        return DepthVideo(path, given)
     if suffix != ".npz" and suffix[1:] in (others := installed("recordings")):
         read = named_object(others[suffix[1:]].value, f"the installed reader of {suffix}")
         return read(path)
@@ -127,7 +117,7 @@ def _opened(
             if stream.read(2) != b"PK":
                 kind = f"that end with {suffix}" if suffix else "without an ending"
                 raise ToftrackError(f"'{path}' is not read, as are no files {kind}; give {_READ}")
-    return read_recording(path, camera_file, bare)
+    return read_recording(path, given)
 
 
 def open_source(name: str) -> FrameStore:

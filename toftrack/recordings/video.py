@@ -13,6 +13,7 @@ come from the disk one at a time.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +23,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.json_text import parse_json
 from toftrack.frames.camera import Camera
-from toftrack.recordings.bare import MILLIMETRE, BareFacts, bare_camera
+from toftrack.recordings.bare import MILLIMETRE, Given, bare_camera, metres_of
 from toftrack.recordings.frame_store import FrameStore, file_of, rate_of
 
 VIDEOS = frozenset(".mkv .avi .mov .mp4 .m4v .webm .mpg .mpeg .wmv .nut".split())
@@ -37,27 +38,40 @@ _MISSING_FRAMES = 5  # fewer at the end say nothing of a file that was cut off
 
 
 class DepthVideo(FrameStore):
-    """The frames of a video. Made by `read_video`."""
+    """The frames of a video: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of
+    16 bits (FFV1).
 
-    def __init__(
-        self,
-        camera: Camera,
-        bare: BareFacts,
-        kinect: Kinect | None,
-        tracks: Sequence[Track],
-        damage: str | None,
-    ) -> None:
+    given: a lens, unit (a millimetre) and frame rate of a video that does not tell them; a lens
+    goes before a Kinect's own calibration. Raises ToftrackError: it is damaged, has colour images
+    or no depth, or nothing tells its camera.
+    """
+
+    unit_m: float
+
+    def __init__(self, path: Path, given: Given) -> None:
+        path = file_of(path)
+        with closing(_opened(path)) as container:
+            kinect = _kinect_of(container, path)
+            number = _grey_stream(container, path, None if kinect is None else kinect.depth)
+            shape = container.streams[number].width, container.streams[number].height
+            if kinect is None:
+                self.camera = bare_camera(path, given, *shape)
+            else:
+                lens = given.camera(*shape, f"'{path}'")
+                self.camera = lens or _camera_of(container, path, *shape)
+            infrared = [] if kinect is None else kinect.infrared
+            grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
+            tracks, self.damage = _scanned(container, path, [number, *grey])
         self._depth, self._amplitude = tracks[0], tracks[1] if len(tracks) > 1 else None
         times_s = self._depth.times_s + (0.0 if kinect is None else kinect.offset_s)
-        self.camera, self.damage = camera, damage
         self.metadata = {} if kinect is None else kinect.facts
-        self.unit_m = bare.unit_m or MILLIMETRE
-        self.fps = bare.fps or rate_of(times_s)
-        self.timestamp_s = np.arange(len(times_s)) / bare.fps if bare.fps else times_s
+        self.unit_m = given.unit_m or MILLIMETRE
+        self.fps = given.fps or rate_of(times_s)
+        self.timestamp_s = np.arange(len(times_s)) / given.fps if given.fps else times_s
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         """An infrared image that is missing is black."""
-        depth = self._depth.image(index).astype(np.float32) * np.float32(self.unit_m)
+        depth = metres_of(self._depth.image(index), self.unit_m)
         if self._amplitude is None:
             return depth, None
         found = self._amplitude.number_at(self._depth.ticks[index])
@@ -116,31 +130,6 @@ class Track:
         stream = self._container.streams[self._stream]
         self._container.seek(int(self.ticks[number]), stream=stream)
         self._images = self._container.decode(stream)
-
-
-def read_video(path: str | Path, camera_file: str | Path | None, bare: BareFacts) -> DepthVideo:
-    """Open a video of depth images.
-
-    path: a recording of an Azure Kinect (`.mkv`), or a lossless grey video of 16 bits (FFV1).
-    camera_file: None = the recording's own calibration, or what is given.  bare: intrinsics, unit
-    (a millimetre) and frame rate of a video that does not tell them. Raises ToftrackError: it is
-    damaged, has colour images or no depth, or nothing tells its camera.
-    """
-    path = file_of(path)
-    container = _opened(path)
-    try:
-        own = _kinect_of(container, path)
-        number = _grey_stream(container, path, None if own is None else own.depth)
-        shape = container.streams[number].width, container.streams[number].height
-        if camera_file is not None or own is None:
-            camera = bare_camera(path, camera_file, bare, *shape)
-        else:
-            camera = _camera_of(container, path, *shape)
-        infrared = [] if own is None else own.infrared
-        grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
-        return DepthVideo(camera, bare, own, *_scanned(container, path, [number, *grey]))
-    finally:
-        container.close()
 
 
 def _opened(path: Path) -> Any:
