@@ -140,7 +140,7 @@ def test_classified_pixels_are_those_of_the_figures(written: Path) -> None:
     segments = rows(written, "world/tracker/segmentation", "SegmentationImage:buffer")
     for moment in (frame.hands[0] for frame in moments()[:FRAMES]):
         seen = moment.insight.observation
-        pixels = classify(moment.estimate.state, moment.shape, seen, f_measure()).labels()
+        _, pixels = classify(moment.estimate.state, moment.shape, seen, f_measure())
         np.testing.assert_array_equal(labels[moment.estimate.index].reshape(144, 176), pixels)
         hand = segments[moment.estimate.index].reshape(144, 176) == 1
         np.testing.assert_array_equal(hand, seen.hand.numpy())

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 import torch
@@ -15,7 +13,7 @@ from toftrack.render.reference import classify_range_images
 from toftrack.render.segmentation import Observation
 
 CLASSES = ("nothing", "neighbourhood", "correct", "false", "missed")
-"""Names of the labels of `Classified.labels`, in order."""
+"""Names of the labels of `classify`, in order."""
 
 # The paper's red, green and blue in the hues of Okabe and Ito, which colour-blind people can tell
 # apart.
@@ -23,41 +21,22 @@ CLASS_RGB = ((255, 255, 255), (205, 205, 205), (213, 94, 0), (0, 158, 115), (0, 
 """Of each of CLASSES."""
 
 
-@dataclass(frozen=True, eq=False)
-class Classified:
-    """One hypothesis against an observation, on the observation's grid; images are (H, W)."""
-
-    range_m: np.ndarray
-    """float32 metres, the hypothesis's surface, 0 = none."""
-    correct: np.ndarray
-    """bool: surface where the image has the hand, at its depth."""
-    false: np.ndarray
-    """bool: surface where the image has none, and nothing hides it."""
-    missed: np.ndarray
-    """bool: the image's hand in the neighbourhood."""
-    neighbourhood: np.ndarray
-    """bool: around the silhouette, outside of it and of the wrist."""
-
-    def labels(self) -> np.ndarray:
-        """(H, W) uint8, positions in CLASSES."""
-        labels = self.neighbourhood.astype(np.uint8)
-        for label, image in ((2, self.correct), (3, self.false), (4, self.missed)):
-            labels[image] = label
-        return labels
-
-
 def classify(
     state: np.ndarray, shape: HandShape, observation: Observation, likelihood: Likelihood
-) -> Classified:
+) -> tuple[np.ndarray, np.ndarray]:
     """Tell the pixels that the likelihood counts; their numbers are the scorer's counts.
 
-    state: (27,) of the hypothesis; where it is NaN there is none, and every image is empty.
+    state: (27,) of the hypothesis; where it is NaN there is none, and both images are empty.
+
+    Returns (H, W) float32 metres, the hypothesis's surface, 0 = none; and (H, W) uint8, positions
+    in CLASSES: correct is surface where the image has the hand, at its depth, false where it has
+    none and nothing hides it, missed the image's hand in the neighbourhood, which is around the
+    silhouette, outside of it and of the wrist.
     """
     evidence = likelihood.evidence(observation)
     height, width = evidence.hand.shape
     if not np.isfinite(state).all():
-        no = np.zeros((height, width), bool)
-        return Classified(no.astype(np.float32), no, no, no, no)
+        return np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
     hand, wrist = parted(posed_hand(state, shape))
     k = evidence.k.numpy()
     range_m = range_image(hand, k, height, width)
@@ -70,4 +49,7 @@ def classify(
         reach = distance_px <= evidence.radius_px
     surface, at_wrist, near = (torch.from_numpy(a)[None] for a in (range_m, on_wrist, reach))
     classes = classify_range_images(surface, at_wrist, near, evidence)
-    return Classified(range_m, *(image[0].numpy() for image in classes))
+    labels = classes.near[0].numpy().astype(np.uint8)
+    for label in (2, 3, 4):
+        labels[getattr(classes, CLASSES[label])[0].numpy()] = label
+    return range_m, labels

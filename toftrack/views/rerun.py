@@ -309,8 +309,8 @@ class _Entities:
         segments = hand.astype(np.uint8)
         segments[occluder] = 2
         self._log(f"{entity}/segmentation", rr.SegmentationImage(segments))
-        pixels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
-        self._log(f"{entity}/classified", rr.SegmentationImage(pixels.labels()))
+        _, labels = classify(tracked.estimate.state, tracked.shape, observation, self._likelihood)
+        self._log(f"{entity}/classified", rr.SegmentationImage(labels))
 
     def _log_particles(self, entity: str, insight: StepInfo) -> None:
         """The middles of the hands that the particles stand for, brighter with their weight."""

@@ -51,17 +51,17 @@ def measurement_figure(run: Run, footage: Footage, row: int, of: str) -> np.ndar
     """
     estimate = run.estimate(row)
     observation = observe(run, footage, row)
-    pixels = classify(estimate.state, run.shape, observation, run.likelihood())
+    range_m, labels = classify(estimate.state, run.shape, observation, run.likelihood())
     hand, depth = observation.hand.cpu().numpy(), observation.depth_m.cpu().numpy()
-    counted = pixels.neighbourhood | (pixels.range_m > 0)
+    counted = (labels > 0) | (range_m > 0)
     shown = counted if counted.any() else hand
     ends = [np.flatnonzero(shown.any(axis))[[0, -1]] for axis in (1, 0) if shown.any()]
     here = tuple(slice(max(0, a - _MARGIN_PX), b + 1 + _MARGIN_PX) for a, b in ends)
     # In one go, so that the same grey is the same distance in both.
-    greys = np.hsplit(range_grey(np.hstack([np.where(hand, depth, 0), pixels.range_m])), 2)
+    greys = np.hsplit(range_grey(np.hstack([np.where(hand, depth, 0), range_m])), 2)
     near = np.full_like(greys[0], 255)
-    near[pixels.neighbourhood], near[pixels.range_m > 0] = 190, 60
-    colours = np.array(CLASS_RGB, np.uint8)[pixels.labels()]
+    near[labels > 0], near[range_m > 0] = 190, 60
+    colours = np.array(CLASS_RGB, np.uint8)[labels]
     figure = chart.new_figure(
         1240, 90 + round(300 * colours[here].shape[0] / colours[here].shape[1])
     )
@@ -74,11 +74,7 @@ def measurement_figure(run: Run, footage: Footage, row: int, of: str) -> np.ndar
     for axes, (picture, caption) in zip(figure.subplots(1, 4), panels, strict=True):
         axes.imshow(picture[here], "gray", vmin=0, vmax=255, interpolation="nearest")
         axes.set(xticks=(), yticks=(), title=caption)
-    counts = (int(image.sum()) for image in (pixels.correct, pixels.false, pixels.missed))
-    names = [
-        *(f"{count} {name}" for count, name in zip(counts, CLASSES[2:], strict=True)),
-        CLASSES[1],
-    ]
+    names = [f"{(labels == n).sum()} {CLASSES[n]}" for n in (2, 3, 4)] + [CLASSES[1]]
     for name, rgb in zip(names, (*CLASS_RGB[2:], CLASS_RGB[1]), strict=True):
         axes.scatter([], [], marker="s", s=80, color=np.divide(rgb, 255), label=name)
     figure.legend(loc="outside lower left", ncols=4, frameon=False)
