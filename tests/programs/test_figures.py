@@ -300,7 +300,10 @@ def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
     names = {path.name for path in draw_figures(run)}
     assert names >= {"course.png", "latent.png"} and "measurement.png" not in names
     said = capsys.readouterr().err
-    assert "note: no measurement.png: " in said and "likelihood of its own, os.system, " in said
+    assert (
+        "note: without measurement.png: " in said
+        and "likelihood of its own, os.system, " in said
+    )
 
 
 def test_the_command_answers_errors_with_a_sentence(
@@ -325,5 +328,5 @@ def test_a_missing_matplotlib_is_one_sentence_and_leaves_out_plots_alone(
         "plot.png": lambda: chart.picture_of(chart.new_figure(90, 90)),
         "picture.png": blank,
     }
-    assert chart.write_figures(run, drawn) == ["picture.png"]
+    assert chart.write_figures(run, drawn) == [run / "picture.png"]
     assert "without plot.png: figures need matplotlib" in capsys.readouterr().err

@@ -24,14 +24,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import make_folder
 from toftrack.frames.frame import Truth
 from toftrack.output.run_folder import Footage, Run, read_run
 from toftrack.programs.command_line import plain_parser
-from toftrack.views.figures.chart import new_figure
+from toftrack.views.figures.chart import new_figure, write_figures
 from toftrack.views.figures.runs import (
     course_figure,
     filmstrip_figure,
@@ -39,7 +38,6 @@ from toftrack.views.figures.runs import (
     lost_figure,
     measurement_figure,
 )
-from toftrack.views.pictures import write_picture
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -89,19 +87,9 @@ def draw_figures(
     ):
         # The folder within the run's must be no link; which one --out is, the user says.
         make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
-        written, missing = [], None
-        for name in tqdm(figures, unit=" figures", file=sys.stderr, delay=1.0, leave=False):
-            try:
-                picture = figures[name]()
-            except ToftrackError as error:  # as of a run whose pose space is of its user's own
-                missing = error
-                print(f"note: no {name}.png: {error}", file=sys.stderr)
-                continue
-            path = target / f"{name}.png"
-            write_picture(path, picture)
-            written.append(path)
-        if missing and not written:
-            raise missing
+        written = write_figures(target, {f"{name}.png": draw for name, draw in figures.items()})
+    if not written:
+        raise ToftrackError("no figure could be drawn; why, the notes above say")
     return written
 
 

@@ -86,7 +86,7 @@ def train(config: DictConfig) -> float:
     error = math.inf if measured is None else measured.degrees
     summary = _summary(kind, data, rows, asked)
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
-    say("\n".join(f"  {folder / name}" for name in (model.name, *figures, "summary.json")))
+    say("\n".join(f"  {path}" for path in (model, *figures, folder / "summary.json")))
     say(f"use it: {_command(model)}")
     if in_sweep():
         print(f"{job_words()}: {len(data)} training poses, error {error:.2f} degrees; {folder}")

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.views.pictures import write_picture
@@ -28,16 +29,9 @@ GREY, SHADE = "#969696", "#fae2de"
 _DPI = 100
 
 
-class MissingMatplotlibError(ToftrackError):
-    """matplotlib, which draws plots, is not installed."""
-
-
 def new_figure(width: int, height: int) -> Figure:
-    """An empty figure of so many pixels; raises MissingMatplotlibError."""
-    try:
-        module = module_of_extra("matplotlib.figure", "figures need matplotlib", "figures")
-    except ToftrackError as error:
-        raise MissingMatplotlibError(str(error)) from None
+    """An empty figure of so many pixels; ToftrackError where matplotlib is missing."""
+    module = module_of_extra("matplotlib.figure", "figures need matplotlib", "figures")
     figure = module.Figure((width / _DPI, height / _DPI), dpi=_DPI, layout="constrained")
     figure.get_layout_engine().set(w_pad=0.1, h_pad=0.1)
     return figure
@@ -63,23 +57,23 @@ def titled(picture: np.ndarray, title: str, note: str = "") -> np.ndarray:
     return np.vstack([picture_of(head), picture])
 
 
-def write_figures(folder: Path, figures: Mapping[str, Callable[[], np.ndarray]]) -> list[str]:
-    """Draw figures and write them below their names; returns the names of those written.
+def write_figures(folder: Path, figures: Mapping[str, Callable[[], np.ndarray]]) -> list[Path]:
+    """Draw figures and write them below their names; returns the files.
 
-    Where matplotlib is missing, plots are left out and a note says so. Raises OSError.
+    What cannot be drawn, as without matplotlib, or of a run whose pose space is of its user's own,
+    is left out, and a note says so. Raises OSError.
     """
-    written, missing = [], None
-    for name, draw in figures.items():
+    written, missing = [], dict[str, list[str]]()
+    for name in tqdm(figures, unit=" figures", file=sys.stderr, delay=1.0, leave=False):
         try:
-            picture = draw()
-        except MissingMatplotlibError as error:
-            missing = error
+            picture = figures[name]()
+        except ToftrackError as error:
+            missing.setdefault(str(error), []).append(name)
             continue
         write_picture(folder / name, picture)
-        written.append(name)
-    if missing is not None:
-        left_out = ", ".join(name for name in figures if name not in written)
-        print(f"note: without {left_out}: {missing}", file=sys.stderr)
+        written.append(folder / name)
+    for why, names in missing.items():
+        print(f"note: without {', '.join(names)}: {why}", file=sys.stderr)
     return written
 
 
