@@ -301,8 +301,7 @@ def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
     assert names >= {"course.png", "latent.png"} and "measurement.png" not in names
     said = capsys.readouterr().err
     assert (
-        "note: without measurement.png: " in said
-        and "likelihood of its own, os.system, " in said
+        "note: without measurement.png: " in said and "likelihood of its own, os.system, " in said
     )
 
 

@@ -118,6 +118,24 @@ def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
         raise
 
 
+def write_on(stream: IO[bytes] | RawIOBase, size: int, *parts: bytes) -> int:
+    """Write bytes at the end of a file of that size, which has no buffer; returns its size then.
+
+    Raises OSError; the file is then as it was.
+    """
+    try:
+        for part in parts:
+            rest = memoryview(part)
+            while rest:  # a disk that is nearly full takes a part
+                rest = rest[stream.write(rest) :]
+    except BaseException:
+        with suppress(OSError):  # whoever reads it copes with a record that is cut off
+            stream.truncate(size)
+            stream.seek(size)
+        raise
+    return size + sum(map(len, parts))
+
+
 def lock(stream: IO[bytes] | RawIOBase | int) -> None:
     """Have a file, or the folder of a descriptor, for oneself among those who ask, until it is
     closed; Windows grants it to all.

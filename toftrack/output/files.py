@@ -7,9 +7,8 @@ import logging
 import mmap
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import IO
 
 from toftrack.errors import MOST_HANDS, ToftrackError
 from toftrack.files.json_text import read_json, read_object
@@ -20,6 +19,7 @@ from toftrack.files.safe_files import (
     open_in_place,
     open_to_read,
     remove_partial,
+    write_on,
 )
 
 _log = logging.getLogger(__name__)
@@ -51,7 +51,8 @@ class LineFile:
         self.path, self._size = folder / LINES, 0
         self._file = open_in_place(self.path)
         try:
-            _lock(self._file, folder)
+            with _one_writer(folder):
+                lock(self._file)
         except BaseException:
             self._file.close()
             raise
@@ -62,22 +63,10 @@ class LineFile:
 
     def append(self, line: str) -> None:
         """Write a line, given without its end."""
-        data = memoryview((line + "\n").encode())
-        begin = self._size
         # Whoever removed it removes all that is written from now on.
         if not os.fstat(self._file.fileno()).st_nlink and not self.path.exists():
             raise FileNotFoundError(errno.ENOENT, f"its {LINES} was removed", str(self.path))
-        try:
-            while data:  # a disk that is nearly full takes a part
-                count = self._file.write(data)
-                data = data[count:]
-                self._size += count
-        except BaseException:
-            self._size = begin
-            with suppress(OSError):
-                self._file.truncate(begin)
-                self._file.seek(begin)
-            raise
+        self._size = write_on(self._file, self._size, (line + "\n").encode())
 
     def close(self) -> None:
         """Close the file, which gives the folder free; a second call does nothing."""
@@ -92,7 +81,8 @@ def locked_lines(folder: Path) -> Iterator[None]:
     """
     check_replaceable(folder / LINES)
     with open_to_read(folder / LINES) as file:
-        _lock(file, folder)
+        with _one_writer(folder):
+            lock(file)
         yield
 
 
@@ -116,11 +106,6 @@ def own_folder(folder: Path) -> int | None:
     """
     with _one_writer(folder):
         return lock_folder(folder)
-
-
-def _lock(file: IO[bytes], folder: Path) -> None:
-    with _one_writer(folder):
-        lock(file)
 
 
 @contextmanager

@@ -18,7 +18,6 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, BinaryIO, cast
@@ -28,7 +27,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.archives import add_array
 from toftrack.files.json_text import parse_json
-from toftrack.files.safe_files import lock, open_in_place, open_new, whole_file
+from toftrack.files.safe_files import lock, open_in_place, open_new, whole_file, write_on
 from toftrack.frames.camera import Camera
 from toftrack.recordings.npz import camera_arrays
 
@@ -97,17 +96,7 @@ class GrowingFile:
 
     def write(self, *parts: bytes) -> None:
         """Write a record. Raises OSError; the file then ends with the record before."""
-        try:
-            for part in parts:
-                rest = memoryview(part)
-                while rest:  # a disk that is nearly full takes a part
-                    rest = rest[self.stream.write(rest) :]
-        except OSError:
-            with suppress(OSError):  # whoever reads it copes with a record that is cut off
-                self.stream.truncate(self.bytes)
-                self.stream.seek(self.bytes)
-            raise
-        self.bytes += sum(map(len, parts))
+        self.bytes = write_on(self.stream, self.bytes, *parts)
 
     def close(self) -> None:
         self.stream.close()
