@@ -41,7 +41,7 @@ from toftrack.pose_space.data.pose_files import file_data
 from toftrack.pose_space.files import fit_pose_space, load_pose_space, save_pose_space
 from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
-from toftrack.recordings.image_folder import PngFolderWriter
+from toftrack.recordings.image_folder import write_image_folder
 from toftrack.recordings.npz import Recording, write_recording
 from toftrack.recordings.sr_frame import encode_frame, nominal_camera
 from toftrack.recordings.srs import SrsWriter
@@ -170,9 +170,7 @@ def _recordings(folder: Path) -> list[Reader]:
         for time in times[:2]:
             writer.append(encode_frame(np.full(shape, 0.8, np.float32), None, range_m), float(time))
     png = folder / "png"
-    with PngFolderWriter(png, camera) as images:
-        for image, time in zip(depth, times, strict=True):
-            images.append(image, amplitude[0], float(time))
+    write_image_folder(png, recording)
     stack = _new(folder, "npy") / "stack.npy"
     np.save(stack, np.rint(1000 * depth).astype(np.uint16))
     words = np.rint(1000 * depth).astype(np.uint16)

@@ -17,8 +17,8 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.programs import convert, record
 from toftrack.recordings.bare import Given
-from toftrack.recordings.image_folder import ImageFolder, PngFolderWriter
-from toftrack.recordings.npz import read_recording
+from toftrack.recordings.image_folder import ImageFolder, write_image_folder
+from toftrack.recordings.npz import Recording, read_recording
 from toftrack.recordings.srs import SrsRecording
 
 EMULATED = ("device.transport=emulated", "device.emulated.fps=500")
@@ -224,18 +224,25 @@ def test_what_a_folder_writer_writes_is_read(tmp_path: Path) -> None:
     camera = Camera(np.diag((9.0, 9, 1)), 8, 6)
     depth = np.random.default_rng(0).uniform(0.2, 3, (2, 6, 8)).astype(np.float32)
     depth[0, 0] = (0, np.nan, np.inf, -1, 70, 1, 1, 1)
-    amplitude = np.arange(48, dtype=np.uint16).reshape(6, 8)
-    with PngFolderWriter(tmp_path / "f", camera, 0.0005, True, 30.0, {"a": 1}) as writer:
-        for number in range(2):
-            writer.append(depth[number], amplitude, number / 7)
+    amplitude = np.arange(96, dtype=np.uint16).reshape(2, 6, 8)
+    recording = Recording(
+        depth=depth,
+        radial=True,
+        camera=camera,
+        timestamp_s=np.array([0, 1 / 7]),
+        fps=30.0,
+        amplitude=amplitude,
+        metadata={"a": 1},
+    )
+    write_image_folder(tmp_path / "f", recording, 0.0005)
     folder = ImageFolder(tmp_path / "f")
     np.testing.assert_array_equal(folder.image(0)[0][0, :5], 0)
     np.testing.assert_allclose(folder.image(1)[0], depth[1], atol=0.00026)
-    np.testing.assert_array_equal(folder.image(1)[1], amplitude)
+    np.testing.assert_array_equal(folder.image(1)[1], amplitude[1])
     np.testing.assert_array_equal(folder.timestamp_s, [0, 1 / 7])
     assert (folder.radial, folder.fps, folder.metadata) == (True, 30, {"a": 1})
     with pytest.raises(ToftrackError, match="has images, camera.json or"):
-        PngFolderWriter(tmp_path / "f", camera)
+        write_image_folder(tmp_path / "f", recording)
 
 
 @pytest.mark.parametrize(

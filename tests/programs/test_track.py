@@ -24,7 +24,6 @@ from helpers.programs import QUICK
 from helpers.tracking import ROOT, sample
 from helpers.videos import video_frames
 
-from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import STATES
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -33,7 +32,8 @@ from toftrack.output.run_folder import read_run
 from toftrack.programs.export import export
 from toftrack.programs.recover import recover
 from toftrack.programs.track import _ShapeFiles
-from toftrack.recordings.image_folder import PngFolderWriter
+from toftrack.recordings.image_folder import write_image_folder
+from toftrack.recordings.store import open_sample
 from toftrack.views.overlay import caption_px
 
 K = np.array([[200.0, 0, 20], [0, 200.0, 15], [0, 0, 1]])
@@ -266,9 +266,7 @@ def test_a_folder_that_is_used_again_lists_what_this_run_wrote(here, tmp_path) -
 
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
     """A folder of images whose third one is damaged."""
-    with PngFolderWriter(tmp_path / "images", Camera(sample().k, 176, 144)) as writer:
-        for number, image in enumerate(sample().depth_m[:4]):
-            writer.append(image, None, number / 25)
+    write_image_folder(tmp_path / "images", open_sample())
     third = tmp_path / "images" / "depth_000002.png"
     third.write_bytes(third.read_bytes()[:200])
     status, _, err = here("device=replay", "device.path=images", "view=none", *QUICK)

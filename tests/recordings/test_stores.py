@@ -15,8 +15,8 @@ from toftrack.frames.camera import Camera
 from toftrack.recordings import npz
 from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.image_folder import PngFolderWriter
-from toftrack.recordings.npz import StreamedImages
+from toftrack.recordings.image_folder import write_image_folder
+from toftrack.recordings.npz import StreamedImages, read_recording
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH, encode_frame, unambiguous_range_m
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.store import open_recording
@@ -41,9 +41,8 @@ def of_srs(folder: Path, words: np.ndarray) -> Path:
 
 
 def of_folder(folder: Path, words: np.ndarray) -> Path:
-    with PngFolderWriter(folder / "a", CAMERA) as writer:
-        for number, image in enumerate(words):
-            writer.append(metres(image), image[::-1], number / 25)
+    of_npz(folder, words)
+    write_image_folder(folder / "a", read_recording(folder / "a.npz"))
     return folder / "a"
 
 

@@ -21,9 +21,9 @@ from tqdm import tqdm
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import whole_file
 from toftrack.programs.command_line import Parser
-from toftrack.recordings.bare import NOTHING_GIVEN, Given
+from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.image_folder import PngFolderWriter
+from toftrack.recordings.image_folder import write_image_folder
 from toftrack.recordings.npz import write_recording
 from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
@@ -34,8 +34,6 @@ from toftrack.recordings.sr_frame import (
 )
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsRecording, srs_frame, srs_head
 from toftrack.recordings.store import open_recording
-
-_MILLIMETRE = 0.001
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -109,7 +107,10 @@ def convert(
             elif kind == ".srs":
                 _to_srs(store, target, unambiguous_range_m(given.modulation_mhz), bar)
             else:
-                _to_folder(store, target, unit_m, bar)
+                own_m = MILLIMETRE
+                if isinstance(store, SrsRecording):  # the camera's own words, as they are
+                    own_m = store.range_m / np.iinfo(np.uint16).max
+                write_image_folder(target, store, unit_m or own_m, bar.update)
         return len(store)
 
 
@@ -129,19 +130,6 @@ def _to_srs(store: FrameStore, target: Path, range_m: float, bar: tqdm) -> None:
                 radial = to_radial(depth, store.radial, store.camera)
                 data = encode_frame(radial, amplitude, range_m)
             stream.write(srs_frame(data, float(time_s)))
-            bar.update()
-
-
-def _to_folder(store: FrameStore, target: Path, unit_m: float | None, bar: tqdm) -> None:
-    if unit_m is None:
-        unit_m = _MILLIMETRE
-        if isinstance(store, SrsRecording):  # the camera's own words, as they are
-            unit_m = store.range_m / np.iinfo(np.uint16).max
-    with PngFolderWriter(
-        target, store.camera, unit_m, store.radial, store.fps, store.metadata
-    ) as writer:
-        for index, time_s in enumerate(store.timestamp_s):
-            writer.append(*store.image(index), float(time_s))
             bar.update()
 
 

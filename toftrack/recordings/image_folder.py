@@ -23,9 +23,10 @@ import os
 import re
 import stat
 import zipfile
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
-from typing import IO, Any, Self
+from typing import IO, Any
 
 import cv2
 import numpy as np
@@ -285,67 +286,46 @@ def _beside(files: Files, image: str, name: str) -> str | None:
     return next((place for place in places if place in files.names), None)
 
 
-class PngFolderWriter:
-    """Writes a folder that `read_image_folder` reads; use it with `with`.
+def write_image_folder(
+    folder: str | Path,
+    store: FrameStore,
+    unit_m: float = MILLIMETRE,
+    progress: Callable[[], object] = lambda: None,
+) -> None:
+    """Write any recording as a folder of PNG images that `ImageFolder` reads.
 
     folder: made when it does not exist; must hold nothing of such a folder.  unit_m: metres of one
-    step of the depth images.  camera, radial, fps, metadata (JSON-able) go to `camera.json`. Raises
-    ToftrackError: the folder cannot be written or is in use.
+    step, to which depth is rounded; no reading and what is too far become 0.  progress: called
+    after each frame. Raises ToftrackError: the folder cannot be written or is in use, or the store
+    not be read.
     """
+    folder = Path(os.path.expanduser(folder))
+    facts = {"depth_unit_m": unit_m, "radial": store.radial, "fps": store.fps}
+    content = store.camera.to_dict() | facts | {"metadata": store.metadata}
 
-    def __init__(
-        self,
-        folder: str | Path,
-        camera: Camera,
-        unit_m: float = 0.001,
-        radial: bool = False,
-        fps: float = DEFAULT_FPS,
-        metadata: dict[str, Any] | None = None,
-    ) -> None:
-        self.folder, self.unit_m, self.frames = Path(os.path.expanduser(folder)), unit_m, 0
-        facts = {"depth_unit_m": unit_m, "radial": radial, "fps": fps, "metadata": metadata or {}}
-        with self._writing():
-            self.folder.mkdir(parents=True, exist_ok=True)
-            names = (_CAMERA, _TIMES)
-            if any(at.suffix.lower() in _DEPTH or at.name in names for at in self.folder.iterdir()):
-                raise ToftrackError(
-                    f"the folder '{self.folder}' has images, {_CAMERA} or {_TIMES} already; choose "
-                    "an empty one"
-                )
-            text = json.dumps(camera.to_dict() | facts, indent=1) + "\n"
-            write_whole(self.folder / _CAMERA, text)
-            self._times = io.TextIOWrapper(open_new(self.folder / _TIMES), encoding="utf-8")
-
-    def append(self, depth_m: np.ndarray, amplitude: np.ndarray | None, timestamp_s: float) -> None:
-        """Add a frame: (H, W) metres, rounded to the unit (no reading and too far become 0), and
-        the (H, W) uint16 amplitude. Raises ToftrackError when it cannot be written."""
-        valid = (depth_m > 0) & (depth_m < np.inf)
-        steps = np.where(valid, depth_m, 0).astype(np.float64) / self.unit_m
-        words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
-        with self._writing():
-            self._save(f"depth_{self.frames:06d}.png", words)
-            if amplitude is not None:
-                self._save(f"amplitude_{self.frames:06d}.png", amplitude)
-            self._times.write(f"{timestamp_s!r}\n")
-        self.frames += 1
-
-    def close(self) -> None:
-        with self._writing():
-            self._times.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
-
-    def _save(self, name: str, image: np.ndarray) -> None:
-        with open_new(self.folder / name) as stream:
+    def save(name: str, image: np.ndarray) -> None:
+        with open_new(folder / name) as stream:
             stream.write(cv2.imencode(".png", image)[1].tobytes())
 
-    def _writing(self) -> AbstractContextManager[None]:
-        what = f"the folder '{self.folder}' cannot be written"
-        return reported_errors(what, "choose another place")
+    with reported_errors(f"the folder '{folder}' cannot be written", "choose another place"):
+        folder.mkdir(parents=True, exist_ok=True)
+        names = (_CAMERA, _TIMES)
+        if any(at.suffix.lower() in _DEPTH or at.name in names for at in folder.iterdir()):
+            raise ToftrackError(
+                f"the folder '{folder}' has images, {_CAMERA} or {_TIMES} already; choose an empty "
+                "one"
+            )
+        write_whole(folder / _CAMERA, json.dumps(content, indent=1) + "\n")
+        with io.TextIOWrapper(open_new(folder / _TIMES), encoding="utf-8") as times:
+            for number, time_s in enumerate(store.timestamp_s):
+                depth_m, amplitude = store.image(number)
+                steps = metres_of(depth_m, 1.0).astype(np.float64) / unit_m
+                words = np.where(steps <= 0xFFFF, np.rint(steps), 0).astype(np.uint16)
+                save(f"depth_{number:06d}.png", words)
+                if amplitude is not None:
+                    save(f"amplitude_{number:06d}.png", amplitude)
+                times.write(f"{float(time_s)!r}\n")
+                progress()
 
 
 def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
