@@ -190,26 +190,29 @@ class SrsRecording(FrameStore):
     radial = True
 
     def __init__(self, path: Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> None:
-        path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
-        with reading(path), open_to_read(path) as stream:
-            scan = _scan(path, stream, os.fstat(stream.fileno()).st_size)
-        if not scan.offsets:
-            reason = f" ({scan.damage})" if scan.damage else ""
+        self.path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
+        self.init: SrsInit | None = None
+        self.registers: bytes | None = None
+        """The first Configure object's 64 bytes."""
+        self._facts = SrsFacts()
+        self._stream: BinaryIO | None = None
+        self._offsets: list[int] = []
+        """Where each frame's data begin."""
+        self._stamps: list[float] = []
+        """NaN for a frame without one."""
+        with reading(self.path), open_to_read(self.path) as stream:
+            self._scan(stream, os.fstat(stream.fileno()).st_size)
+        if not self._offsets:
+            reason = f" ({self.damage})" if self.damage else ""
             raise ToftrackError(
                 f"the recording '{path}' has no whole frame{reason}; record it again"
             )
-        facts, stamps = scan.facts, np.array(scan.stamps, np.float64)
+        facts, stamps = self._facts, np.array(self._stamps, np.float64)
         usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
-        self.path, self.camera = path, facts.camera or nominal_camera()
+        self.camera, self.metadata = facts.camera or nominal_camera(), facts.metadata
         self.range_m = facts.range_m or default_range_m
         self.timestamp_s = stamps if usable else np.arange(len(stamps)) / facts.fps
         self.fps = rate_of(self.timestamp_s, facts.fps)
-        self.metadata, self.damage = facts.metadata, scan.damage
-        self.init = scan.init or SrsInit()
-        self.registers = scan.registers
-        """The first Configure object's 64 bytes."""
-        self._offsets = scan.offsets
-        self._stream: BinaryIO | None = None
 
     def raw(self, index: int) -> bytes:
         """A frame as the camera sent it, FRAME_BYTES bytes. Raises ToftrackError if unreadable."""
@@ -230,91 +233,77 @@ class SrsRecording(FrameStore):
             self._stream.close()
             self._stream = None
 
-
-@dataclass
-class _Scan:
-    """What a walk over the objects found."""
-
-    offsets: list[int] = field(default_factory=list)
-    """Where each frame's data begin."""
-    stamps: list[float] = field(default_factory=list)
-    """NaN for a frame without one."""
-    init: SrsInit | None = None
-    registers: bytes | None = None
-    facts: SrsFacts = field(default_factory=SrsFacts)
-    damage: str | None = None
-
-
-def _scan(path: Path, stream: BinaryIO, size: int) -> _Scan:
-    header = stream.read(_PAIR.size)
-    if len(header) < _PAIR.size:
-        raise ToftrackError(
-            f"the file '{path}' is empty or cut off within its first bytes; record it again"
-        )
-    signature, version = _PAIR.unpack(header)
-    if signature != _SIGNATURE:
-        raise ToftrackError(
-            f"'{path}' is not an .srs stream file: it does not begin with 'srIO'; give a recording "
-            "as the vendor's or toftrack's recorder writes it"
-        )
-    if version != _VERSION:
-        raise ToftrackError(
-            f"the stream file '{path}' has version {version}, but this toftrack reads version "
-            f"{_VERSION}; convert it with the vendor's tools"
-        )
-    scan, position, stamp = _Scan(), _PAIR.size, np.nan
-    while position < size and scan.damage is None:
-        base = stream.read(_PAIR.size)
-        if len(base) < _PAIR.size:
-            scan.damage = f"cut off at byte {position}"
-            break
-        kind, length = _PAIR.unpack(base)
-        if length < _PAIR.size:
-            scan.damage = f"an object of {length} bytes at byte {position} makes no sense"
-        elif position + length > size:
-            scan.damage = f"cut off in the object at byte {position}"
-        elif kind == _STAMP and length == _PAIR.size + _SECONDS.size:
-            (stamp,) = _SECONDS.unpack(stream.read(_SECONDS.size))
-        elif kind == _FRAME:
-            _frame(path, scan, position, length, stamp)
-            stamp = np.nan
-        else:
-            _other(path, scan, kind, stream, length - _PAIR.size)
-        position += length
-        stream.seek(position)
-    if scan.damage is None and not np.isnan(stamp):
-        scan.damage = "cut off behind a time stamp"
-    return scan
-
-
-def _frame(path: Path, scan: _Scan, position: int, length: int, stamp: float) -> None:
-    for name, missing in (("Init", scan.init is None), ("Configure", scan.registers is None)):
-        if missing:
+    def _scan(self, stream: BinaryIO, size: int) -> None:
+        """Walk over the objects; ToftrackError where they break the format."""
+        header = stream.read(_PAIR.size)
+        if len(header) < _PAIR.size:
             raise ToftrackError(
-                f"the recording '{path}' has a frame before its {name} object, which breaks the "
-                "format; record it again"
+                f"the file '{self.path}' is empty or cut off within its first bytes; record it "
+                "again"
             )
-    if length != _PAIR.size + FRAME_BYTES:
-        scan.damage = (
-            f"the frame at byte {position} has {length - _PAIR.size} bytes instead of an SR3000's "
-            f"{FRAME_BYTES}"
-        )
-        return
-    scan.offsets.append(position + _PAIR.size)
-    scan.stamps.append(stamp)
+        signature, version = _PAIR.unpack(header)
+        if signature != _SIGNATURE:
+            raise ToftrackError(
+                f"'{self.path}' is not an .srs stream file: it does not begin with 'srIO'; give a "
+                "recording as the vendor's or toftrack's recorder writes it"
+            )
+        if version != _VERSION:
+            raise ToftrackError(
+                f"the stream file '{self.path}' has version {version}, but this toftrack reads "
+                f"version {_VERSION}; convert it with the vendor's tools"
+            )
+        position, stamp = _PAIR.size, np.nan
+        while position < size and self.damage is None:
+            base = stream.read(_PAIR.size)
+            if len(base) < _PAIR.size:
+                self.damage = f"cut off at byte {position}"
+                break
+            kind, length = _PAIR.unpack(base)
+            if length < _PAIR.size:
+                self.damage = f"an object of {length} bytes at byte {position} makes no sense"
+            elif position + length > size:
+                self.damage = f"cut off in the object at byte {position}"
+            elif kind == _STAMP and length == _PAIR.size + _SECONDS.size:
+                (stamp,) = _SECONDS.unpack(stream.read(_SECONDS.size))
+            elif kind == _FRAME:
+                self._frame(position, length, stamp)
+                stamp = np.nan
+            else:
+                self._other(kind, stream, length - _PAIR.size)
+            position += length
+            stream.seek(position)
+        if self.damage is None and not np.isnan(stamp):
+            self.damage = "cut off behind a time stamp"
 
+    def _frame(self, position: int, length: int, stamp: float) -> None:
+        for name, missing in (("Init", self.init is None), ("Configure", self.registers is None)):
+            if missing:
+                raise ToftrackError(
+                    f"the recording '{self.path}' has a frame before its {name} object, which "
+                    "breaks the format; record it again"
+                )
+        if length != _PAIR.size + FRAME_BYTES:
+            self.damage = (
+                f"the frame at byte {position} has {length - _PAIR.size} bytes instead of an "
+                f"SR3000's {FRAME_BYTES}"
+            )
+            return
+        self._offsets.append(position + _PAIR.size)
+        self._stamps.append(stamp)
 
-def _other(path: Path, scan: _Scan, kind: int, stream: BinaryIO, length: int) -> None:
-    if kind == _INIT and scan.init is None:
-        if length != _THREE.size:
-            raise ToftrackError(f"the Init object of '{path}' is damaged; record it again")
-        scan.init = SrsInit(*_THREE.unpack(stream.read(length)))
-    elif kind == _CONFIGURE and scan.registers is None:
-        if length != REGISTERS:
-            raise ToftrackError(f"the Configure object of '{path}' is damaged; record it again")
-        scan.registers = stream.read(length)
-    elif kind == _FACTS and length <= _LARGEST_FACTS:
-        scan.facts = _parse_facts(path, stream.read(length))
+    def _other(self, kind: int, stream: BinaryIO, length: int) -> None:
+        if kind == _INIT and self.init is None:
+            if length != _THREE.size:
+                raise ToftrackError(f"the Init object of '{self.path}' is damaged; record it again")
+            self.init = SrsInit(*_THREE.unpack(stream.read(length)))
+        elif kind == _CONFIGURE and self.registers is None:
+            if length != REGISTERS:
+                raise ToftrackError(
+                    f"the Configure object of '{self.path}' is damaged; record it again"
+                )
+            self.registers = stream.read(length)
+        elif kind == _FACTS and length <= _LARGEST_FACTS:
+            self._facts = _parse_facts(self.path, stream.read(length))
 
 
 def _object(kind: int, content: bytes) -> bytes:
