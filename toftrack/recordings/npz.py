@@ -58,6 +58,7 @@ _TRUTH: dict[str, tuple[type, tuple[int, ...]]] = {
     "pose_name": (str, ()),
 }
 """Fields of `Truth`, which are keys of a file: their type, and the shape of one frame's."""
+_FIRST = {name: name for name in _TRUTH}
 _OTHER = {name: f"{name}2" for name in _TRUTH} | {"joints_m": "joints2_m"}
 """The keys of the other hand's."""
 _KEYS = (*_IMAGES, *_CAMERA, "fps", "timestamp_s", *_TRUTH, *_OTHER.values(), "metadata")
@@ -172,7 +173,23 @@ def read_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> Recording:
             f"the recording '{path}' is damaged ({error}); copy or record it again"
         ) from error
     try:
-        return _parse(arrays, given)
+        key = "depth_m" if "depth_m" in arrays else "radial_m"
+        depth = _check_depth(arrays[key], key)
+        _check_layout(depth.shape, arrays, key)
+        count, height, width = depth.shape
+        camera = _camera_of(arrays, width, height, given)
+        timestamp_s, fps = _times(arrays, count, given.fps)
+        metadata = _metadata(arrays)
+        return Recording(
+            depth=depth,
+            radial=key == "radial_m",
+            camera=camera,
+            timestamp_s=timestamp_s,
+            fps=fps,
+            amplitude=_amplitude(arrays, depth.shape),
+            truth=_read_truth(arrays, count, metadata),
+            metadata=metadata,
+        )
     except ToftrackError as error:
         raise ToftrackError(f"the recording '{path}' cannot be used: {error}") from None
 
@@ -210,8 +227,10 @@ def write_recording(
     }
     if store.image(0)[1] is not None:
         arrays["amplitude"] = Pieces(shape, np.dtype("<u2"), amplitude_images())
-    if store.truth is not None:
-        arrays |= _truth_arrays(store.truth)
+    hands = ((store.truth, _FIRST), (store.truth and store.truth.other, _OTHER))
+    for truth, keys in hands:  # sides and rests belong into the metadata
+        told = {key: getattr(truth, name, None) for name, key in keys.items()}
+        arrays |= {key: array for key, array in told.items() if array is not None}
     with reported_errors(f"the recording '{path}' cannot be written", "choose another place"):
         write_archive(path, arrays)
 
@@ -236,26 +255,6 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
         for key in _KEYS
         if key in headers
     }
-
-
-def _parse(arrays: dict[str, Any], given: Given) -> Recording:
-    depth_key = "depth_m" if "depth_m" in arrays else "radial_m"
-    depth = _check_depth(arrays[depth_key], depth_key)
-    _check_layout(depth.shape, arrays, depth_key)
-    count, height, width = depth.shape
-    camera = _camera_of(arrays, width, height, given)
-    timestamp_s, fps = _times(arrays, count, given.fps)
-    metadata = _metadata(arrays)
-    return Recording(
-        depth=depth,
-        radial=depth_key == "radial_m",
-        camera=camera,
-        timestamp_s=timestamp_s,
-        fps=fps,
-        amplitude=_amplitude(arrays, depth.shape),
-        truth=_read_truth(arrays, count, metadata),
-        metadata=metadata,
-    )
 
 
 def some_images(depth: Images) -> np.ndarray:
@@ -372,21 +371,13 @@ def _camera_of(arrays: dict[str, Any], width: int, height: int, given: Given) ->
     return Camera(width=width, height=height, **own)
 
 
-def _truth_arrays(truth: Truth) -> dict[str, np.ndarray]:
-    """The arrays of a file; sides and rests belong into its metadata."""
-    arrays = {name: getattr(truth, name) for name in _TRUTH}
-    if truth.other is not None:
-        arrays |= {key: getattr(truth.other, name) for name, key in _OTHER.items()}
-    return {key: value for key, value in arrays.items() if value is not None}
-
-
 def _read_truth(arrays: dict[str, Any], count: int, metadata: dict[str, Any]) -> Truth | None:
     """The truth of `count` frames; None where a file has none.
 
     Sides and rests are read from the metadata where it has them: `side` (or `handedness`) and
     `side2`, and `still`, the first and the last frame of each rest of the first hand.
     """
-    first = _truth_of_one(arrays, count, {name: name for name in _TRUTH})
+    first = _truth_of_one(arrays, count, _FIRST)
     if first is None:
         return None
     other = _truth_of_one(arrays, count, _OTHER)

@@ -183,6 +183,7 @@ def recover_recording(path: Path, overwrite: bool = False) -> tuple[Path, int]:
 
 
 def _make_npz(target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence[_Kept]) -> None:
+    """Of the frames' pieces in `source`, which zipfile by itself would compress again."""
     camera = facts.camera
     shape = (len(frames), camera.height, camera.width)
     arrays: dict[str, Any] = {
@@ -194,45 +195,29 @@ def _make_npz(target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence
     }
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         for kind, name in enumerate(facts.image_names):
-            _add_images(archive, target, name, shape, source, frames, kind)
+            content = io.BytesIO()
+            about = {"descr": IMAGE_TYPES[kind], "fortran_order": False, "shape": shape}
+            np.lib.format.write_array_header_1_0(content, about)
+            header = content.getvalue()
+            head = compressed(header)
+            image_bytes = math.prod(shape) * np.dtype(IMAGE_TYPES[kind]).itemsize
+            entry = zipfile.ZipInfo(f"{name}.npy")
+            entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o600 << 16
+            entry.file_size = len(header) + image_bytes
+            entry.compress_size = len(head) + sum(frame.sizes[kind] for frame in frames) + len(_END)
+            entry.CRC = _joined_checksum(zlib.crc32(header), frames[-1].sums[kind], image_bytes)
+            entry.header_offset = target.tell()
+            target.write(entry.FileHeader(zip64=True) + head)
+            for frame in frames:
+                source.seek(frame.at + sum(frame.sizes[:kind]))
+                for piece in _in_pieces(source, frame.sizes[kind]):
+                    target.write(piece)
+            target.write(_END)
+            archive.filelist.append(entry)
+            archive.NameToInfo[entry.filename] = entry
+            archive.start_dir = target.tell()  # where the next member comes
         for name, value in arrays.items():
             add_array(archive, name, value)
-
-
-def _add_images(
-    archive: zipfile.ZipFile,
-    target: BinaryIO,
-    name: str,
-    shape: tuple[int, ...],
-    source: BinaryIO,
-    frames: Sequence[_Kept],
-    kind: int,
-) -> None:
-    """Add the images of one kind to an archive, which is written to `target` and not closed yet;
-    zipfile by itself would compress them again.
-    """
-    content = io.BytesIO()
-    header = {"descr": IMAGE_TYPES[kind], "fortran_order": False, "shape": shape}
-    np.lib.format.write_array_header_1_0(content, header)
-    head = compressed(content.getvalue())
-    image_bytes = math.prod(shape) * np.dtype(IMAGE_TYPES[kind]).itemsize
-    entry = zipfile.ZipInfo(f"{name}.npy")
-    entry.compress_type, entry.external_attr = zipfile.ZIP_DEFLATED, 0o600 << 16
-    entry.file_size = len(content.getvalue()) + image_bytes
-    entry.compress_size = len(head) + sum(frame.sizes[kind] for frame in frames) + len(_END)
-    checksum = zlib.crc32(content.getvalue())
-    entry.CRC = _joined_checksum(checksum, frames[-1].sums[kind], image_bytes)
-    entry.header_offset = target.tell()
-    target.write(entry.FileHeader(zip64=True))
-    target.write(head)
-    for frame in frames:
-        source.seek(frame.at + sum(frame.sizes[:kind]))
-        for piece in _in_pieces(source, frame.sizes[kind]):
-            target.write(piece)
-    target.write(_END)
-    archive.filelist.append(entry)
-    archive.NameToInfo[entry.filename] = entry
-    archive.start_dir = target.tell()  # where the next member comes
 
 
 def compressed(raw: bytes) -> bytes:
