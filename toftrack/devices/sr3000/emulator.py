@@ -66,20 +66,6 @@ _HARMLESS = {"split", "garbage", "zeros", "ones", "unplug_after"}
 """A whole frame comes nevertheless."""
 
 
-@dataclass(frozen=True)
-class _Fault:
-    """A fault of `count` attempts or requests in a row, the first of them number `first`."""
-
-    kind: str
-    first: int = 0
-    count: int | None = None
-    """None = all that follow."""
-
-    def hits(self, number: int) -> bool:
-        """Whether this attempt or request goes wrong."""
-        return self.first <= number and (self.count is None or number < self.first + self.count)
-
-
 @dataclass(eq=False)
 class _Chunk:
     """A piece of what waits at the bulk IN endpoint."""
@@ -125,11 +111,12 @@ def _transfer(
     return [_Chunk(ready_s, whole)]
 
 
-def _parse_faults(texts: Iterable[str]) -> tuple[_Fault, ...]:
-    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on);
+def _parse_faults(texts: Iterable[str]) -> list[tuple[str, float, float]]:
+    """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on):
+    the kind, and the numbers of the first and the last attempt or request that it hits.
     ToftrackError for an unknown kind or another form.
     """
-    faults = []
+    faults: list[tuple[str, float, float]] = []
     for text in map(str, texts):
         match = re.fullmatch(r"([a-z_]+)(?:@(\d+)(\+|x(\d+))?)?", text)
         if match is None or match[1] not in _OPEN_FAULTS | _REQUEST_FAULTS:
@@ -137,10 +124,11 @@ def _parse_faults(texts: Iterable[str]) -> tuple[_Fault, ...]:
                 f"device.emulated.faults: '{text}' is unknown; give KIND, KIND@7, KIND@7x3 or "
                 f"KIND@7+, where KIND is one of {', '.join(_OPEN_FAULTS | _REQUEST_FAULTS)}"
             )
-        kind, first, rest, count = match.groups()
-        always = first is None or rest == "+"
-        faults.append(_Fault(kind, int(first or 0), None if always else int(count or 1)))
-    return tuple(faults)
+        kind, number, rest, count = match.groups()
+        first = int(number or 0)
+        always = number is None or rest == "+"
+        faults.append((kind, first, np.inf if always else first + int(count or 1) - 1))
+    return faults
 
 
 @dataclass(frozen=True)
@@ -404,7 +392,8 @@ class EmulatedBackend(IBackend):
 
     def _fault(self, kinds: Collection[str], number: int) -> str | None:
         """The first fault of some kinds that hits an attempt or request."""
-        hit = (f.kind for f in self._faults if f.kind in kinds and f.hits(number))
+        faults = self._faults
+        hit = (kind for kind, a, b in faults if kind in kinds and a <= number <= b)
         return next(hit, None)
 
     def _open_fault(self) -> str | None:
