@@ -56,10 +56,13 @@ class TrackedFrame:
 
 class View:
     """Where tracked frames are shown or kept; made with folder, fps and frames (None: unknown).
+    view=none is this one, which keeps nothing.
 
     Used with `with`, which closes it. It writes nothing before the first frame. It is left when the
     results are written, so it may stay.
     """
+
+    def __init__(self, *_: Any, **__: Any) -> None: ...
 
     def show(self, tracked: TrackedFrame) -> None:
         """Take one frame; raises ToftrackError when it cannot be kept."""
@@ -76,9 +79,3 @@ class View:
 
     def __exit__(self, *exception: Any) -> None:
         self.close()
-
-
-class NoView(View):
-    """Shows and keeps nothing."""
-
-    def __init__(self, *_: Any, **__: Any) -> None: ...
