@@ -86,11 +86,11 @@ def test_the_skin_follows_the_joints() -> None:
 
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_the_mesh_is_closed_and_faces_outwards(side: str) -> None:
-    mesh = hand_mesh(default_hand_shape(side=side))
-    corners = mesh.points_m[mesh.triangles]
+    points_m, normals, _, triangles = hand_mesh(default_hand_shape(side=side))
+    corners = points_m[triangles]
     outwards = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    assert (np.einsum("fa,fa->f", outwards, mesh.normals[mesh.triangles].mean(1)) > 0).all()
-    edges = np.sort(mesh.triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
+    assert (np.einsum("fa,fa->f", outwards, normals[triangles].mean(1)) > 0).all()
+    edges = np.sort(triangles[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), 1)
     assert (np.unique(edges, axis=0, return_counts=True)[1] == 2).all()
     volume = np.einsum("fa,fa->f", corners[:, 0], outwards).sum() / 6
     assert 2e-4 < volume < 9e-4  # m3, all ellipsoids by themselves

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -179,19 +179,20 @@ def _add_hand(file: _File, motion: HandMotion) -> None:
 
 def _mesh(file: _File, motion: HandMotion) -> int:
     """The number of the mesh."""
-    gltf, mesh = file.gltf, hand_mesh(motion.shape)
-    joints = np.zeros((len(mesh.joint), 4), np.uint8)
-    joints[:, 0] = mesh.joint
-    weights = np.zeros((len(mesh.joint), 4), np.float32)
+    gltf = file.gltf
+    points_m, normals, joint, triangles = hand_mesh(motion.shape)
+    joints = np.zeros((len(joint), 4), np.uint8)
+    joints[:, 0] = joint
+    weights = np.zeros((len(joint), 4), np.float32)
     weights[:, 0] = 1
     attributes = gltf.Attributes(
-        POSITION=file.array(mesh.points_m, gltf.VEC3, gltf.ARRAY_BUFFER, limits=True),
-        NORMAL=file.array(mesh.normals, gltf.VEC3, gltf.ARRAY_BUFFER),
+        POSITION=file.array(points_m, gltf.VEC3, gltf.ARRAY_BUFFER, limits=True),
+        NORMAL=file.array(normals, gltf.VEC3, gltf.ARRAY_BUFFER),
         JOINTS_0=file.array(joints, gltf.VEC4, gltf.ARRAY_BUFFER),
         WEIGHTS_0=file.array(weights, gltf.VEC4, gltf.ARRAY_BUFFER),
     )
-    triangles = mesh.triangles.ravel().astype(np.uint32)
-    indices = file.array(triangles, gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER)
+    corners = triangles.ravel().astype(np.uint32)
+    indices = file.array(corners, gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER)
     primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
     file.document.meshes.append(gltf.Mesh(name=motion.name("skin"), primitives=[primitive]))
     return len(file.document.meshes) - 1
@@ -299,21 +300,13 @@ _POINTS = 146
 _WORLD = np.array([1.0, -1.0, -1.0])
 
 
-class HandMesh(NamedTuple):
-    """A straight hand with its wrist at the origin, in the world of OpenXR."""
+def hand_mesh(shape: HandShape) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The mesh of a straight hand with its wrist at the origin, in the world of OpenXR; an
+    ellipsoid is a ball of its own, which moves with one joint.
 
-    points_m: np.ndarray
-    """(V, 3)."""
-    normals: np.ndarray
-    """(V, 3)."""
-    joint: np.ndarray
-    """(V,) of OpenXR, which each point moves with."""
-    triangles: np.ndarray
-    """(F, 3) of points, anticlockwise seen from outside."""
-
-
-def hand_mesh(shape: HandShape) -> HandMesh:
-    """The mesh of a shape: an ellipsoid is a ball of its own, which moves with one joint."""
+    Returns points, m, and normals, (V, 3) each; the joint of OpenXR that each point moves with,
+    (V,); and triangles (F, 3) of points, anticlockwise seen from outside.
+    """
     shape = shape.to("cpu", torch.float64)
     surface = hand_surface(shape)
     rest = forward_kinematics(torch.zeros(1, 27, dtype=torch.float64), shape)
@@ -329,7 +322,7 @@ def hand_mesh(shape: HandShape) -> HandMesh:
     triangles = turned + len(ball) * np.arange(len(axes))[:, None, None]
     frames = surface.frame_index[:-1].numpy()
     joint = np.repeat(np.array(JOINT_OF_FRAME)[frames], len(ball))
-    return HandMesh(points.reshape(-1, 3), normals.reshape(-1, 3), joint, triangles.reshape(-1, 3))
+    return points.reshape(-1, 3), normals.reshape(-1, 3), joint, triangles.reshape(-1, 3)
 
 
 def _ball() -> tuple[np.ndarray, np.ndarray]:

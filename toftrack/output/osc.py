@@ -18,17 +18,17 @@ from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import hands_of, line_content
 from toftrack.output.stream import UdpStream
 
-PARTS = ("joints", "landmarks", "openxr")
-"""What may be sent of a hand beside the rest."""
 _FIELDS = (
     *("index", "timestamp_s", "lost", "confidence", "side", "gesture", "gesture_probability"),
     *("pinch", "pinching", "pointing_origin_m", "pointing_direction", "joint_ok"),
 )
-_FIELDS_OF = {
-    "joints": ("joints_m",),
-    "landmarks": ("landmarks",),
-    "openxr": ("openxr_position_m", "openxr_orientation", "openxr_radius_m"),
+_OPENXR = ("openxr_position_m", "openxr_orientation", "openxr_radius_m")
+_PARTS = {
+    "joints": ("joint", JOINT_NAMES, ("joints_m",)),
+    "landmarks": ("landmark", JOINT_NAMES, ("landmarks",)),
+    "openxr": ("openxr", OPENXR_JOINT_NAMES, _OPENXR),
 }
+"""What may be sent of a hand beside the rest: its address, the joints, and their fields."""
 
 Message = tuple[str, list[tuple[str, Any]]]
 """An address, and arguments each with their OSC type."""
@@ -44,16 +44,16 @@ class OscStream(UdpStream):
     def __init__(self, host: str, port: int, parts: Sequence[str]) -> None:
         super().__init__(host, port, None)
         self._parts = (parts,) if isinstance(parts, str) else tuple(parts)
-        if unknown := [part for part in self._parts if part not in PARTS]:
+        if unknown := [part for part in self._parts if part not in _PARTS]:
             raise ToftrackError(
                 f"stream.parts names the unknown part {unknown[0]!r}; give some of "
-                f"{', '.join(PARTS)}"
+                f"{', '.join(_PARTS)}"
             )
         self._bundles, self._messages = (
             module_of_extra(f"pythonosc.osc_{kind}_builder", "stream=osc needs python-osc", "osc")
             for kind in ("bundle", "message")
         )
-        more = (name for part in self._parts for name in _FIELDS_OF[part])
+        more = (name for part in self._parts for name in _PARTS[part][2])
         self._names = (*_FIELDS, *more)
         self._tracked: set[str] = set()
 
@@ -103,15 +103,9 @@ def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Itera
     yield from _floats(
         f"{root}/pointing", [*hand["pointing_origin_m"], *hand["pointing_direction"]]
     )
-    for part, name, names in (
-        ("joints", "joint", JOINT_NAMES),
-        ("landmarks", "landmark", JOINT_NAMES),
-        ("openxr", "openxr", OPENXR_JOINT_NAMES),
-    ):
+    for part, (name, joints, fields) in _PARTS.items():
         if part in parts:
-            for joint, *row in zip(
-                names, *(hand[field] for field in _FIELDS_OF[part]), strict=True
-            ):
+            for joint, *row in zip(joints, *(hand[field] for field in fields), strict=True):
                 yield from _floats(f"{root}/{name}/{joint}", np.hstack(row).tolist())
 
 
