@@ -207,11 +207,11 @@ class FailedJobs(Callback):
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         # Before Hydra writes: two runs that begin together would share, or clear, one folder.
-        _expect(_given(config, "run"), alone=True)
+        _expect(_given(config, "run"))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         folder = _given(config, "sweep")
-        _expect(folder, alone=True)
+        _expect(folder)
         for job in folder.iterdir() if os.path.isdir(folder) else ():
             let_links_go(job)
             _let_links_go(job)
@@ -235,16 +235,15 @@ def _given(config: DictConfig, kind: str) -> Path:
     return Path(folder)
 
 
-def _expect(folder: Path, alone: bool = False) -> None:
-    """A run or a sweep is about to make this folder. One with files in it is nobody's to clear.
-
-    alone: it is to have the folder for itself.
+def _expect(folder: Path) -> None:
+    """A run or a sweep is about to make this folder, which it has for itself. One with files in it
+    is nobody's to clear.
     """
     path = folder.absolute()
     new = tuple(place for place in (path, *path.parents) if not os.path.exists(place))
     try:
         with contextlib.suppress(OSError):  # Hydra will say it, too
-            if alone and _program.running and (lock := own_folder(path)) is not None:
+            if _program.running and (lock := own_folder(path)) is not None:
                 _program.locks.append(lock)
     except ToftrackError as error:
         raise _JobFailedError(error) from error
