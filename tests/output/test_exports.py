@@ -37,22 +37,6 @@ def exported(estimates: list[Estimate], side: str) -> Gltf:
     return Gltf(glb_of(motions_of(results_of(estimates), (default_hand_shape(side=side),))))
 
 
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_every_joint_is_a_node_with_a_key_a_frame_that_puts_it_where_it_was(side: str) -> None:
-    estimates = moving(side)
-    gltf = exported(estimates, side)
-    channels = gltf.channels()
-    letter = side[0].upper()
-    for name in OPENXR_JOINT_NAMES:
-        for path in ("translation", "rotation"):
-            time, values, steps = channels[f"{name.title()}_{letter}", path]
-            assert np.allclose(time, np.arange(8) / 25) and len(values) == 8 and steps == "LINEAR"
-    for frame in (0, 5):
-        world = gltf.world(frame)
-        places = np.stack([world[f"{n.title()}_{letter}"][:3, 3] for n in OPENXR_JOINT_NAMES])
-        assert np.allclose(places, estimates[frame].openxr_position_m, atol=2e-6)
-
-
 def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
     first, *_ = estimates = moving()  # as long as hands are on average
     (motion,) = motions_of(results_of(estimates), (default_hand_shape(0.17),))

@@ -61,13 +61,18 @@ def test_a_glb_loads_and_moves_each_hand_that_was_there(
     gltf = Gltf(made.read_bytes())
     for side in there:
         letter = side[0].upper()
-        _, shown, _ = gltf.channels()[f"Hand_{letter}", "scale"]
+        names, channels = [f"{n.title()}_{letter}" for n in OPENXR_JOINT_NAMES], gltf.channels()
+        _, shown, _ = channels[f"Hand_{letter}", "scale"]
         assert np.flatnonzero(shown[:, 0] == 0).tolist() == [LOST]
+        for key in ((name, path) for name in names for path in ("translation", "rotation")):
+            time_s, values, steps = channels[key]
+            assert np.allclose(time_s, np.arange(FRAMES) / 25)
+            assert len(values) == FRAMES and steps == "LINEAR"
         for frame in (0, 3, MISSED, FRAMES - 1):
             as_in = frame - 1 if frame == MISSED else frame
-            seen = hand_estimate(as_in, side, bent=0.1 * as_in)
-            tip = seen.openxr_position_m[OPENXR_JOINT_NAMES.index("index_tip")]
-            assert np.allclose(gltf.world(frame)[f"Index_Tip_{letter}"][:3, 3], tip, atol=1e-5)
+            seen, world = hand_estimate(as_in, side, bent=0.1 * as_in), gltf.world(frame)
+            places = [world[name][:3, 3] for name in names]
+            assert np.allclose(places, seen.openxr_position_m, atol=2e-6)
 
 
 @pytest.mark.parametrize("sides", SLOTS)
