@@ -86,7 +86,7 @@ class RosBag(FrameStore):
         self._next = 0
         with closing(bag):
             topic = self._topic = _choose(bag, given.topic)
-            first = _image(path, topic, topic.first, self.unit_m, 0)
+            first = self._metres(topic.first, 0)
             what = f"the first image of {topic.name} in '{path}'"
             check_metres(first, what, _OTHER_UNIT)
             height, width = first.shape
@@ -109,7 +109,7 @@ class RosBag(FrameStore):
         except StopIteration:
             raise ToftrackError(f"'{self.path}' ended while it was read; is it copied?") from None
         self._next = index + 1
-        depth = _image(self.path, self._topic, message, self.unit_m, index)
+        depth = self._metres(message, index)
         if depth.shape != (self.camera.height, self.camera.width):
             raise ToftrackError(
                 f"frame {index} of '{self.path}' has {depth.shape[1]}x{depth.shape[0]} pixels, but "
@@ -120,6 +120,15 @@ class RosBag(FrameStore):
     def close(self) -> None:
         self._messages = None
         self._bag.close()
+
+    def _metres(self, message: Any, index: int) -> np.ndarray:
+        try:
+            return depth_image(message, self._topic.kind, self.unit_m)
+        except ToftrackError as error:
+            raise ToftrackError(
+                f"image {index} of the topic {self._topic.name} in '{self.path}' cannot be used: "
+                f"{error}"
+            ) from None
 
     def _go_to(self, index: int) -> None:
         start_ns = int(self._recorded_ns[index])
@@ -267,15 +276,6 @@ def _camera(bag: _Bag, topic: _Topic) -> Camera:
     except ToftrackError as error:
         raise ToftrackError(
             f"{sibling} of '{bag.path}' cannot be used as camera: {error}"
-        ) from None
-
-
-def _image(path: Path, topic: _Topic, message: Any, unit_m: float, index: int) -> np.ndarray:
-    try:
-        return depth_image(message, topic.kind, unit_m)
-    except ToftrackError as error:
-        raise ToftrackError(
-            f"image {index} of the topic {topic.name} in '{path}' cannot be used: {error}"
         ) from None
 
 

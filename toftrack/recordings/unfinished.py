@@ -59,11 +59,6 @@ class Facts:
     fps: float
     metadata: dict[str, Any]
 
-    @property
-    def image_names(self) -> tuple[str, ...]:
-        """Of the arrays of images in the `.npz`, in the order of the pieces of a record."""
-        return ("radial_m" if self.radial else "depth_m", "amplitude")[: 1 + self.amplitude]
-
 
 @dataclass(frozen=True)
 class _Kept:
@@ -194,7 +189,8 @@ def _make_npz(target: BinaryIO, source: BinaryIO, facts: Facts, frames: Sequence
         "metadata": json.dumps(facts.metadata),
     }
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
-        for kind, name in enumerate(facts.image_names):
+        names = "radial_m" if facts.radial else "depth_m", "amplitude"
+        for kind, name in enumerate(names[: 1 + facts.amplitude]):
             content = io.BytesIO()
             about = {"descr": IMAGE_TYPES[kind], "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(content, about)

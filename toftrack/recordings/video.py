@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -51,20 +50,18 @@ class DepthVideo(FrameStore):
     def __init__(self, path: Path, given: Given) -> None:
         path = file_of(path)
         with closing(_opened(path)) as container:
-            kinect = _kinect_of(container, path)
-            number = _grey_stream(container, path, None if kinect is None else kinect.depth)
+            depth, infrared, offset_s, self.metadata = _kinect_of(container, path)
+            number = _grey_stream(container, path, depth)
             shape = container.streams[number].width, container.streams[number].height
-            if kinect is None:
+            if depth is None:
                 self.camera = bare_camera(path, given, *shape)
             else:
                 lens = given.camera(*shape, f"'{path}'")
                 self.camera = lens or _camera_of(container, path, *shape)
-            infrared = [] if kinect is None else kinect.infrared
             grey = [index for index in infrared if _kind(container.streams[index])[1] in _GREY]
             tracks, self.damage = _scanned(container, path, [number, *grey])
         self._depth, self._amplitude = tracks[0], tracks[1] if len(tracks) > 1 else None
-        times_s = self._depth.times_s + (0.0 if kinect is None else kinect.offset_s)
-        self.metadata = {} if kinect is None else kinect.facts
+        times_s = self._depth.times_s + offset_s
         self.unit_m = given.unit_m or MILLIMETRE
         self.fps = given.fps or rate_of(times_s)
         self.timestamp_s = np.arange(len(times_s)) / given.fps if given.fps else times_s
@@ -225,28 +222,16 @@ _CALIBRATION = "calibration.json"
 _ADVICE = "give a calibrated camera with camera.file=FILE"
 
 
-@dataclass(frozen=True)
-class Kinect:
-    """What a recording of an Azure Kinect says of itself.
-
-    depth, infrared: numbers of its tracks, of infrared one or none.  offset_s: of the camera's
-    clock at the file's time 0.  facts: for the recording's metadata, JSON-able.
-    """
-
-    depth: int
-    infrared: list[int]
-    offset_s: float
-    facts: dict[str, Any]
-
-
-def _kinect_of(container: Any, path: Path) -> Kinect | None:
-    """What an Azure Kinect's recording says of itself; None for every other video. Raises
-    ToftrackError when it was recorded without depth.
+def _kinect_of(container: Any, path: Path) -> tuple[int | None, list[int], float, dict[str, Any]]:
+    """What an Azure Kinect's recording says of itself: the numbers of its tracks of depth and of
+    infrared (one or none); seconds of the camera's clock at the file's time 0; and facts for the
+    metadata, JSON-able. Of every other video there is none of that. Raises ToftrackError when it
+    was recorded without depth.
     """
     depth, infrared = _tracks(container, "DEPTH"), _tracks(container, "IR")
     if not depth:
         if not any(key.startswith("K4A_") for key in container.metadata):
-            return None
+            return None, [], 0.0, {}
         raise ToftrackError(
             f"'{path}' is a recording of an Azure Kinect without depth; record it with a depth "
             "mode (k4arecorder --depth-mode NFOV_UNBINNED)"
@@ -256,7 +241,7 @@ def _kinect_of(container: Any, path: Path) -> Kinect | None:
     facts = {key: tags[name] for key, name in names.items() if name in tags}
     offset = tags.get("K4A_START_OFFSET_NS", "")
     offset_s = int(offset) / 1e9 if offset.isdecimal() else 0.0
-    return Kinect(depth[0], infrared, offset_s, facts)
+    return depth[0], infrared, offset_s, facts
 
 
 def _camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
