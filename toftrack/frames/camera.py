@@ -135,7 +135,17 @@ class Camera:
         object.__setattr__(self, "K", K)
         object.__setattr__(self, "width", int(self.width))
         object.__setattr__(self, "height", int(self.height))
-        object.__setattr__(self, "distortion", self._checked_distortion())
+        if self.lens not in _LENSES:
+            raise ToftrackError(f"the lens must be {' or '.join(_LENSES)}, but is {self.lens!r}")
+        counts = _COUNTS if self.lens == "opencv" else (4,)
+        count = np.size(self.distortion)
+        if count not in counts:
+            raise ToftrackError(
+                f"the lens distortion must be {', '.join(map(str, counts))} numbers (OpenCV's k1 "
+                f"k2 p1 p2 k3 ...), but has {count}"
+            )
+        distortion = _numbers(self.distortion, (count,), "the lens distortion")
+        object.__setattr__(self, "distortion", distortion)
         count = np.size(self.depth_polynomial)
         if count > _MOST_COEFFICIENTS:
             raise ToftrackError(
@@ -150,17 +160,6 @@ class Camera:
             object.__setattr__(self, "depth_polynomial_range_m", tuple(map(float, limits)))
         else:
             object.__setattr__(self, "depth_polynomial_range_m", ())
-
-    def _checked_distortion(self) -> np.ndarray:
-        if self.lens not in _LENSES:
-            raise ToftrackError(f"the lens must be {' or '.join(_LENSES)}, but is {self.lens!r}")
-        counts = _COUNTS if self.lens == "opencv" else (4,)
-        if np.size(self.distortion) not in counts:
-            raise ToftrackError(
-                f"the lens distortion must be {', '.join(map(str, counts))} numbers (OpenCV's k1 "
-                f"k2 p1 p2 k3 ...), but has {np.size(self.distortion)}"
-            )
-        return _numbers(self.distortion, (np.size(self.distortion),), "the lens distortion")
 
     @cached_property
     def _distorted(self) -> bool:

@@ -25,7 +25,7 @@ from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports import HandMotion, glb_of, motions_of
 from toftrack.output.lines import DROPPED
-from toftrack.output.run_folder import Run, read_run
+from toftrack.output.run_folder import read_run
 from toftrack.programs.command_line import plain_parser
 
 FORMATS = ("glb", "bvh", "csv")
@@ -46,27 +46,26 @@ def export(folder: Path, kind: str) -> list[Path]:
 
     Raises ToftrackError: the folder is no run's, or has no hand; or the file cannot be written.
     """
-    contents = _contents(read_run(folder), kind)
+    run = read_run(folder)
+    if kind == "csv":
+        contents = {"hand.csv": csv_of(run.results).encode()}
+    else:
+        motions = motions_of(run.results, run.shapes)
+        if kind == "glb":
+            contents = {"hand.glb": glb_of(motions)}
+        else:  # a file has one skeleton
+            steps_s = np.diff(motions[0].time_s)
+            if len(steps_s) and steps_s.max() > 1.5 * np.median(steps_s):
+                print(
+                    "note: frames are not evenly spaced, which a .bvh cannot say", file=sys.stderr
+                )
+            slots = {motion.slot: bvh_of(motion).encode() for motion in motions}
+            several = len(run.shapes) > 1
+            contents = {f"hand{slot + 1 if several else ''}.bvh": c for slot, c in slots.items()}
     with reported_errors(f"'{folder}' cannot be written", "copy it to where it can be"):
         for name, content in contents.items():
             write_whole(folder / name, content)
     return [folder / name for name in contents]
-
-
-def _contents(run: Run, kind: str) -> dict[str, bytes]:
-    """What each file is to hold, by its name."""
-    if kind == "csv":
-        return {"hand.csv": csv_of(run.results).encode()}
-    motions = motions_of(run.results, run.shapes)
-    steps_s = np.diff(motions[0].time_s)
-    if kind == "bvh" and len(steps_s) and steps_s.max() > 1.5 * np.median(steps_s):
-        print("note: frames are not evenly spaced, which a .bvh cannot say", file=sys.stderr)
-    if kind == "glb":
-        return {"hand.glb": glb_of(motions)}
-    if len(run.shapes) == 1:
-        return {"hand.bvh": bvh_of(motions[0]).encode()}
-    # A file has one skeleton.
-    return {f"hand{motion.slot + 1}.bvh": bvh_of(motion).encode() for motion in motions}
 
 
 _CM = 100.0

@@ -107,20 +107,17 @@ class RealSense(SdkCamera):
         self._realtime = bool(realtime)
         self._asked: Callable[[], tuple[bool, Any]]
         self._playback: Any = None
-        if self._emulator is not None:
-            self._describe_emulated(self._emulator, loop=emulated.loop)
-
-    def _describe_emulated(self, emulator: EmulatedCamera, loop: bool) -> None:
-        store = emulator.store
-        self.fps, self.metadata = emulator.fps, store.metadata
-        self.description["fps"] = self.fps
-        if loop:
+        if self._emulator is None:
             return
-        stop = len(store) if self._stop is None else min(self._stop, len(store))
-        self.frames = max(0, stop - self._start)
-        # Only when nothing is dropped does each frame have its row.
-        if store.truth is not None and self._capacity > 1:
-            self.truth = store.truth[self._start : stop]
+        store = self._emulator.store
+        self.fps, self.metadata = self._emulator.fps, store.metadata
+        self.description["fps"] = self.fps
+        if not emulated.loop:
+            stop = len(store) if self._stop is None else min(self._stop, len(store))
+            self.frames = max(0, stop - self._start)
+            # Only when nothing is dropped does each frame have its row.
+            if store.truth is not None and self._capacity > 1:
+                self.truth = store.truth[self._start : stop]
 
     def _run(self) -> None:
         rs, config = self._rs, self._rs.config()
