@@ -9,7 +9,6 @@ import pytest
 from helpers.readers import write_readers
 
 from toftrack.errors import ToftrackError
-from toftrack.programs.applications import with_recording
 from toftrack.programs.report import read_runs, report
 from toftrack.recordings.store import open_recording
 from toftrack.recordings.unfinished import recover_recording
@@ -35,11 +34,6 @@ def test_every_reader_refuses_a_pipe_in_place_of_its_file(tmp_path: Path) -> Non
             assert reader.name == "overrides.yaml"  # a job that is told to have failed
 
 
-def test_a_device_is_no_recording() -> None:
-    with pytest.raises(ToftrackError, match="is a device, and only files"):
-        open_recording("/dev/zero")
-
-
 def test_a_folder_with_a_pipe_is_no_bag(tmp_path: Path) -> None:
     pytest.importorskip("rosbags", reason="rosbags is not installed")
     for name in ("metadata.yaml", "one.db3"):
@@ -61,8 +55,3 @@ def test_names_that_are_not_utf8_are_reported(
     assert "udcff" in (tmp_path / "sweep.csv").read_text(encoding="utf-8")
     assert "1 of 2 jobs failed" in capsys.readouterr().out
     assert len(read_runs(tmp_path)) == 2
-
-
-def test_an_empty_name_is_no_recording() -> None:
-    with pytest.raises(ToftrackError, match="name is empty"):
-        with_recording([""])

@@ -168,6 +168,7 @@ def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missin
 @pytest.mark.parametrize(
     ("words", "reported"),
     [
+        ([""], "name is empty"),
         (["a.npz", "b.npz"], "two recordings, 'a.npz' and 'b.npz'"),
         (["${x}.npz"], "rename the file"),
         (["device", "=", "sample"], "'device' is no recording; .*without blanks as device=VALUE"),
