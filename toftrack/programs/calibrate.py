@@ -11,7 +11,7 @@ import json
 import sys
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -40,19 +40,6 @@ _SEARCHED = 24
 """So many frames are looked at for a board before all are searched for its corners: 5 s."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Calibration:
-    """A camera with its depth polynomial, and how it was found: in so many frames."""
-
-    camera: Camera
-    lens: Lens
-    depth: DepthFit
-    pairs: DepthPairs
-    amplitudes: list[np.ndarray]
-    """Of the lens's views."""
-    searched: int
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
     parser = plain_parser("toftrack calibrate", __doc__)
@@ -77,50 +64,34 @@ def main(arguments: Sequence[str] | None = None) -> None:
     with closing(open_with_own_camera(options.recording, given)) as store:
         size = store.camera.width, store.camera.height
         start = given.camera(*size, "the recording") or store.camera
-        result = _calibrate(store, board, square_m, start, options.keep_lens, options.frames)
-    out = Path(options.out).expanduser()
-    folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
-    result.camera.save(out)
-    facts = _facts(result, start)
-    text = _report(facts)
-    _write_report(folder, result, facts, text, board)
-    print(text)
-    print(f"camera file: {out}\nreport:      {folder}")
-
-
-def _calibrate(
-    store: FrameStore,
-    board: tuple[int, int],
-    square_m: float,
-    start: Camera,
-    keep_lens: bool,
-    frames: int,
-) -> _Calibration:
-    """Calibrate from so many frames, evenly spread, of a recording.
-
-    Raises ToftrackError when there are no amplitudes, or too few frames show the board.
-    """
-    if store.image(0)[1] is None:
-        raise ToftrackError(
-            "the recording has no amplitude images, in which the chequerboard is found; record "
-            "them, too"
-        )
-    numbers = np.unique(np.linspace(0, len(store) - 1, frames).round().astype(int))
-    views = _views(store, board, numbers)
-    fit = calibration.known_lens if keep_lens else calibration.fit_lens
-    lens = fit(views, board, square_m, start)
-    images = []
-    for view in lens.views:
-        depth, amplitude = store.image(view.index)
-        assert amplitude is not None
-        # A recording of Z was made with the recording's own camera: that is taken back.
-        images.append((to_radial(depth, store.radial, store.camera), amplitude))
+        if store.image(0)[1] is None:
+            raise ToftrackError(
+                "the recording has no amplitude images, in which the chequerboard is found; record "
+                "them, too"
+            )
+        spread = np.linspace(0, len(store) - 1, options.frames)
+        numbers = np.unique(spread.round().astype(int))
+        fit = calibration.known_lens if options.keep_lens else calibration.fit_lens
+        lens = fit(_views(store, board, numbers), board, square_m, start)
+        images = []
+        for view in lens.views:
+            depth, amplitude = store.image(view.index)
+            assert amplitude is not None  # as of the first frame
+            # A recording of Z was made with the recording's own camera: that is taken back.
+            images.append((to_radial(depth, store.radial, store.camera), amplitude))
     pairs = calibration.depth_pairs(lens, board, square_m, images)
     found = calibration.fit_depth(pairs)
     camera = replace(
         lens.camera, depth_polynomial=found.polynomial, depth_polynomial_range_m=found.range_m
     )
-    return _Calibration(camera, lens, found, pairs, [a for _, a in images], len(numbers))
+    out = Path(options.out).expanduser()
+    folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
+    camera.save(out)
+    facts = _facts(start, camera, lens, pairs, found, len(numbers))
+    text = _report(facts)
+    _write_report(folder, lens, [amplitude for _, amplitude in images], facts, text, board)
+    print(text)
+    print(f"camera file: {out}\nreport:      {folder}")
 
 
 def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> list[View]:
@@ -145,7 +116,7 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
 
 def _amplitude(store: FrameStore, number: int) -> np.ndarray:
     amplitude = store.image(int(number))[1]
-    assert amplitude is not None  # `_calibrate` made sure that there are some
+    assert amplitude is not None  # `main` made sure that there are some
     return amplitude
 
 
@@ -171,9 +142,10 @@ def _report(facts: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def _facts(result: _Calibration, start: Camera) -> dict[str, Any]:
-    """Of report.json."""
-    pairs, fit = result.pairs, result.depth
+def _facts(
+    start: Camera, camera: Camera, lens: Lens, pairs: DepthPairs, fit: DepthFit, searched: int
+) -> dict[str, Any]:
+    """Of report.json.  searched: how many frames were."""
 
     def one(camera: Camera, polynomial: tuple[float, ...]) -> dict[str, Any]:
         distance, error = calibration.frame_errors(pairs, polynomial)
@@ -191,24 +163,29 @@ def _facts(result: _Calibration, start: Camera) -> dict[str, Any]:
         }
 
     return {
-        "frames_searched": result.searched,
-        "frames_used": len(result.lens.views),
+        "frames_searched": searched,
+        "frames_used": len(lens.views),
         "nearest_m": float(pairs.true_m.min()),
         "farthest_m": float(pairs.true_m.max()),
-        "reprojection_px": float(np.sqrt(np.mean(result.lens.errors_px**2))),
+        "reprojection_px": float(np.sqrt(np.mean(lens.errors_px**2))),
         "order": fit.order,
         "validation_mm": {str(order): mm for order, mm in fit.validation_mm.items()},
         "before": one(start, ()),
-        "after": one(result.camera, fit.polynomial),
+        "after": one(camera, fit.polynomial),
     }
 
 
 def _write_report(
-    folder: Path, result: _Calibration, facts: dict[str, Any], text: str, board: tuple[int, int]
+    folder: Path,
+    lens: Lens,
+    amplitudes: Sequence[np.ndarray],
+    facts: dict[str, Any],
+    text: str,
+    board: tuple[int, int],
 ) -> None:
-    views = result.lens.views
+    views = lens.views
     chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
-    sheet = _corner_sheet([(result.amplitudes[i], views[i].corners_px) for i in chosen], board)
+    sheet = _corner_sheet([(amplitudes[i], views[i].corners_px) for i in chosen], board)
     what = f"the report folder '{folder}' cannot be written"
     with reported_errors(what, "choose another with --report"):
         folder.mkdir(parents=True, exist_ok=True)
