@@ -323,9 +323,9 @@ def test_a_missing_matplotlib_is_one_sentence_and_leaves_out_plots_alone(
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[figures\]'"):
         draw_figures(run)
-    drawn = {
-        "plot.png": lambda: chart.picture_of(chart.new_figure(90, 90)),
-        "picture.png": blank,
-    }
+    drawn = [
+        ("plot.png", lambda: chart.picture_of(chart.new_figure(90, 90))),
+        ("picture.png", blank),
+    ]
     assert chart.write_figures(run, drawn) == [run / "picture.png"]
     assert "without plot.png: figures need matplotlib" in capsys.readouterr().err

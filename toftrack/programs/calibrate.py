@@ -192,7 +192,7 @@ def _write_report(
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         write_picture(folder / "corners.png", sheet)
-        write_figures(folder, {"depth_error.png": lambda: _error_plot(facts)})
+        write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
 
 
 def _board(text: str) -> tuple[int, int]:

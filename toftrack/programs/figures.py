@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import make_folder
@@ -87,7 +88,9 @@ def draw_figures(
     ):
         # The folder within the run's must be no link; which one --out is, the user says.
         make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
-        written = write_figures(target, {f"{name}.png": draw for name, draw in figures.items()})
+        drawn = [(f"{name}.png", draw) for name, draw in figures.items()]
+        bar = tqdm(drawn, unit=" figures", file=sys.stderr, delay=1.0, leave=False)
+        written = write_figures(target, bar)
     if not written:
         raise ToftrackError("no figure could be drawn; why, the notes above say")
     return written

@@ -277,7 +277,7 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     points = [group for group in groups if None not in (group.error, group.cost_ms)]
     if points:
         label = f"{figure.removeprefix('metrics.')}, mean over recordings"
-        written += chart.write_figures(folder, {"sweep.png": lambda: sweep_figure(points, label)})
+        written += chart.write_figures(folder, [("sweep.png", lambda: sweep_figure(points, label))])
     print("\n" + "\n".join(_printable(f"  {path}") for path in written))
     return runs, groups
 

@@ -74,13 +74,13 @@ def train(config: DictConfig) -> float:
 
     model = folder / "pose_space.npz"
     save_pose_space(space, model, data.sources)
-    drawn = {
-        "poses.png": poses_figure,
-        "manifold.png": manifold_figure,
-        "traversals.png": traversals_figure,
-        "corners.png": corners_figure,
-    }
-    figures = write_figures(folder, {name: partial(draw, space) for name, draw in drawn.items()})
+    drawn = (
+        ("poses.png", poses_figure),
+        ("manifold.png", manifold_figure),
+        ("traversals.png", traversals_figure),
+        ("corners.png", corners_figure),
+    )
+    figures = write_figures(folder, [(name, partial(draw, space)) for name, draw in drawn])
     asked = next(row for row in rows if row.dims == dims)
     measured = asked.training if clips == 1 else asked.reached
     error = math.inf if measured is None else measured.degrees

@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import sys
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.views.pictures import write_picture
@@ -57,16 +56,19 @@ def titled(picture: np.ndarray, title: str, note: str = "") -> np.ndarray:
     return np.vstack([picture_of(head), picture])
 
 
-def write_figures(folder: Path, figures: Mapping[str, Callable[[], np.ndarray]]) -> list[Path]:
-    """Draw figures and write them below their names; returns the files.
+def write_figures(
+    folder: Path, figures: Iterable[tuple[str, Callable[[], np.ndarray]]]
+) -> list[Path]:
+    """Draw figures and write them below their names, each of which comes with what draws it;
+    returns the files.
 
     What cannot be drawn, as without matplotlib, or of a run whose pose space is of its user's own,
     is left out, and a note says so. Raises OSError.
     """
     written, missing = [], dict[str, list[str]]()
-    for name in tqdm(figures, unit=" figures", file=sys.stderr, delay=1.0, leave=False):
+    for name, draw in figures:
         try:
-            picture = figures[name]()
+            picture = draw()
         except ToftrackError as error:
             missing.setdefault(str(error), []).append(name)
             continue
