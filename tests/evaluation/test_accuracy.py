@@ -5,13 +5,13 @@ import json
 import cv2
 import numpy as np
 import pytest
+from helpers.tracking import ROOT
 from omegaconf import OmegaConf
 
 from toftrack.configuration.compose import configuration
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import accuracy, results, runs
 from toftrack.programs import benchmark
-from toftrack.recordings.store import packaged_sample
 
 QUICK = ("experiment=paper", "filter.particles=30")
 """Overrides with which a start takes no time; how good the track is does not matter."""
@@ -22,7 +22,7 @@ def folder(tmp_path_factory):
     """Two short recordings with truth, and one file without."""
     where = tmp_path_factory.mktemp("sets") / "short"
     where.mkdir()
-    with packaged_sample() as path, np.load(path) as sample:
+    with np.load(ROOT / "toftrack" / "data" / "sample.npz") as sample:
         for name, begin in (("a", 0), ("b", 30)):
             rows = slice(begin, begin + 4)
             arrays = {k: v[rows] if v.shape[:1] == (100,) else v for k, v in sample.items()}

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.programs import QUICK
+from helpers.tracking import ROOT
 
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.shape_space import COMPONENTS
 from toftrack.output.advice import LostFrame, RunFacts
 from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.programs.main import main
-from toftrack.recordings.store import packaged_sample
 
 K = np.array([[300.0, 0, 88], [0, 300, 72], [0, 0, 1]])
 
@@ -68,9 +68,9 @@ def tracked(folder: Path, capsys: pytest.CaptureFixture[str], *words: str) -> tu
 def test_a_focal_length_that_makes_the_hand_small_is_reported_at_the_end(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with packaged_sample() as path:
-        words = [str(path), "device.intrinsics=[340,340,88,72]", "device.stop=24"]
-        summary, said = tracked(tmp_path, capsys, *words)
+    path = str(ROOT / "toftrack" / "data" / "sample.npz")
+    words = [path, "device.intrinsics=[340,340,88,72]", "device.stop=24"]
+    summary, said = tracked(tmp_path, capsys, *words)
     (doubt,) = summary["doubts"]
     assert "as only small children's are" in doubt and f"note: {doubt}" in said
     assert summary["hand"]["fitted"] and summary["file"]["fitted"]["poses"] > 0

@@ -17,12 +17,7 @@ from toftrack.frames.frame import Frame
 from toftrack.recordings.bare import Given
 from toftrack.recordings.doubts import doubts
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.store import (
-    FIRST_SAMPLE,
-    open_recording,
-    packaged_sample,
-    sample_file,
-)
+from toftrack.recordings.store import FIRST_SAMPLE, open_recording, open_sample, sample_file
 
 _log = logging.getLogger(__name__)
 
@@ -58,7 +53,9 @@ class Replay(BaseDevice):
         if not path:
             raise ToftrackError("no recording to replay was given; set device.path=PATH")
         known = Given(**given)
-        self._recording = store = store or open_recording(path, known)
+        if store is None:
+            store = open_recording(path, known)
+        self._recording = store
         if store.damage:
             _log.warning("%s: %s; its %d whole frames are used", path, store.damage, len(store))
         if store.left_out:
@@ -152,11 +149,9 @@ class Sample(Replay):
     """
 
     def __init__(self, name: str = FIRST_SAMPLE, **playback: Any) -> None:
-        with packaged_sample(name) as path:
-            super().__init__(path, **playback)
         # Where the package happens to be installed says nothing about the result.
-        recording = f"toftrack/data/{sample_file(name)}"
-        self.description |= {"device": "sample", "name": name, "recording": recording}
+        super().__init__(f"toftrack/data/{sample_file(name)}", store=open_sample(name), **playback)
+        self.description |= {"device": "sample", "name": name}
 
 
 def _checked_range(start: int, stop: int | None, count: int, path: str | Path) -> range:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-from contextlib import AbstractContextManager
 from importlib import resources
 from pathlib import Path
 
@@ -126,20 +125,15 @@ def open_source(name: str) -> FrameStore:
 
 
 def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
-    """A recording that comes with the package, by its name; see `packaged_sample`."""
-    with packaged_sample(name) as path:
+    """A recording that comes with the package, by its name. ToftrackError as `sample_file`."""
+    with resources.as_file(resources.files("toftrack") / "data" / sample_file(name)) as path:
         return open_recording(path)
 
 
-def packaged_sample(name: str = FIRST_SAMPLE) -> AbstractContextManager[Path]:
-    """A recording that comes with the package, as a file while the context is open. Raises
-    ToftrackError when there is none of that name; it lists those that there are.
-    """
-    return resources.as_file(resources.files("toftrack") / "data" / sample_file(name))
-
-
 def sample_file(name: str) -> str:
-    """The file's name of a sample, in toftrack/data. Raises ToftrackError when there is none."""
+    """The file's name of a sample, in toftrack/data. Raises ToftrackError when there is none of
+    that name; it lists those that there are.
+    """
     if name not in SAMPLES:
         near = difflib.get_close_matches(str(name), SAMPLES, 1)
         meant = f"; did you mean {near[0]}?" if near else ""
