@@ -1,39 +1,51 @@
-"""What is said when most of a run was lost, on made-up facts."""
+"""What is said when most of a run was lost."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from toftrack.frames.estimate import no_estimate
-from toftrack.output.advice import LostFrame, RunFacts, Watch, advice, lost_frame
+from toftrack.output.advice import RunFacts, Watch, advice, lost_frame, tracked_frame
 
 REACH_M = 1.05
-ORDINARY = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False)
+LOST = no_estimate(0, 0.0, "searching", 4, 0.01)
 
 
-def facts(frame: LostFrame, lost: int = 60, tracked: int = 40) -> RunFacts:
-    whole = RunFacts()
+def insight(hand_px: int = 900, other_side: bool = False) -> Any:
+    """What the tracker saw, as far as anybody asks."""
+    observation = SimpleNamespace(hand=np.ones(hand_px))
+    features = SimpleNamespace(other_side=2.0 if other_side else 0.0)
+    return SimpleNamespace(observation=observation, detection=None, features=features)
+
+
+def facts(
+    nearest_m: float = 0.5, farthest_m: float = 2.0, lost: int = 60, tracked: int = 40, **seen: Any
+) -> RunFacts:
+    """Of a run whose lost frames saw something between two distances."""
+    whole, depth = RunFacts(), np.linspace(nearest_m, farthest_m, 40)[:, None].repeat(30, 1)
     for _ in range(lost):
-        whole.add_lost(frame)
+        whole.add(lost_frame(LOST, depth, insight(**seen), REACH_M))
     for _ in range(tracked):
-        whole.add_tracked(other_side=None)
+        whole.add(tracked_frame(None))
     return whole
 
 
 def test_nothing_is_said_of_runs_that_went_well() -> None:
     assert advice(RunFacts(), "right", REACH_M) == ()
-    assert advice(facts(ORDINARY, 50, 50), "right", REACH_M) == ()
+    assert advice(facts(lost=50, tracked=50), "right", REACH_M) == ()
 
 
 @pytest.mark.parametrize(
     ("changes", "remedy"),
     [
-        ({"read": 0.0, "within": 0.0, "nearest_m": np.nan, "farthest_m": np.nan}, "the lens"),
+        ({"nearest_m": 0.0, "farthest_m": 0.0}, "the lens"),
         ({"nearest_m": 0.0005, "farthest_m": 0.002}, "in metres"),
-        ({"nearest_m": 1.5, "within": 0.0}, "hold the hand nearer"),
+        ({"nearest_m": 1.5}, "hold the hand nearer"),
         ({"nearest_m": 0.15}, "keep the hand 0.3 to 1 m away"),
         ({"other_side": True}, "give hand.side=left"),
         ({"hand_px": 40}, "fewer than 150 pixels"),
@@ -41,7 +53,7 @@ def test_nothing_is_said_of_runs_that_went_well() -> None:
     ],
 )
 def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
-    seen, first, *more = advice(facts(replace(ORDINARY, **changes)), "right", REACH_M)
+    seen, first, *more = advice(facts(**changes), "right", REACH_M)
     assert remedy in first and not more
     assert seen.startswith("60 of 100 frames")
 
@@ -49,11 +61,11 @@ def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
 def test_a_hand_of_the_other_side_that_is_followed_is_reported() -> None:
     followed = RunFacts()
     for i in range(10):
-        followed.add_tracked(other_side=i < 6)
+        followed.add(tracked_frame(insight(other_side=i < 6)))
     (reported,) = advice(followed, "left", REACH_M)
     assert "In 6 of 10 frames" in reported and "give hand.side=right" in reported
     for _ in range(2):
-        followed.add_tracked(other_side=False)
+        followed.add(tracked_frame(insight()))
     assert advice(followed, "left", REACH_M) == ()
 
 
@@ -64,9 +76,9 @@ def test_a_frames_facts_are_read_off_its_image() -> None:
     lost = no_estimate(0, 0.0, "lost", 4, 0.01)
     seen = lost_frame(lost, depth, None, REACH_M)
     assert seen.read == pytest.approx(0.75, abs=0.02)
-    assert seen.within == pytest.approx(0.75 * 0.55 / 2, abs=0.02)
     assert (seen.nearest_m, seen.farthest_m) == pytest.approx((0.54, 2.46), abs=0.02)
-    assert (seen.hand_px, seen.other_side) == (0, None)
+    assert not any(seen.counts[name] for name in ("out_of_reach", "with_hand", "judged"))
+    assert lost_frame(lost, depth, None, 0.4).counts["out_of_reach"]
     watch = Watch(REACH_M)
     watch.see((lost,), np.zeros_like(depth), (None,))
     watch.see((replace(lost, lost=False),), depth, (None,))

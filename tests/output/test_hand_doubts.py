@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.programs import QUICK
 from helpers.tracking import ROOT
 
+from toftrack.frames.estimate import no_estimate
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.shape_space import COMPONENTS
-from toftrack.output.advice import LostFrame, RunFacts
+from toftrack.output.advice import RunFacts, lost_frame, tracked_frame
 from toftrack.output.summary import apparent_doubt, length_doubt
 from toftrack.programs.main import main
 
@@ -38,15 +40,20 @@ def test_hands_of_people_and_unsure_fits_are_not_doubted() -> None:
 
 
 def test_how_long_a_lost_hand_seemed_counts_where_most_was_lost_and_it_was_seen_often() -> None:
-    seen = LostFrame("searching", 0.9, 0.3, 0.5, 2.0, 900, False, apparent_m=0.226)
-    unseen = dataclasses.replace(seen, apparent_m=None)
+    detection = SimpleNamespace(present=0.95, length_m=0.226)
+    about = {"observation": SimpleNamespace(hand=np.ones(9)), "features": None}
+    depth, lost = np.ones((6, 8), np.float32), no_estimate(0, 0.0, "searching", 4, 0.01)
+    seen, unseen = (
+        lost_frame(lost, depth, SimpleNamespace(detection=found, **about), 2.0)
+        for found in (detection, SimpleNamespace(present=0.85, length_m=0.3))
+    )
 
     def mean(often: int, seldom: int, tracked: int) -> float | None:
         facts = RunFacts()
         for frame in [seen] * often + [unseen] * seldom:
-            facts.add_lost(frame)
+            facts.add(frame)
         for _ in range(tracked):
-            facts.add_tracked(None)
+            facts.add(tracked_frame(None))
         return facts.mean_apparent_m()
 
     assert mean(20, 10, 5) == pytest.approx(0.226)

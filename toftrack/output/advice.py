@@ -37,65 +37,32 @@ _FEWEST_FRAMES = 20
 """Of a run that is shorter."""
 
 
-@dataclass(frozen=True)
-class LostFrame:
-    """What was seen in a frame that was lost."""
-
-    state_name: str
-    read: float
-    """Share of pixels with a reading."""
-    within: float
-    """Share of pixels with one within reach."""
-    nearest_m: float
-    farthest_m: float
-    """Between these nearly all readings lie; NaN without any."""
-    hand_px: int
-    """That were taken for the hand."""
-    other_side: bool | None
-    """It looks rather like the other hand; None where nobody says."""
-    apparent_m: float | None = None
-    """How long the hand seemed, from wrist to middle fingertip; None where nobody says."""
-
-
 @dataclass
 class RunFacts:
-    """What is known of a run's lost frames; nearly all their readings lie between two distances."""
+    """What is known of a run, or of one frame of it: of those that were lost; nearly all their
+    readings lie between two distances.
+    """
 
     counts: Counter[str] = field(default_factory=Counter)
-    """Frames of each kind, see add_lost and add_tracked."""
+    """Frames of each kind, see tracked_frame and lost_frame."""
     states: Counter[str] = field(default_factory=Counter)
     """Lost frames by state name."""
     read: float = 0.0
     """Sum of the shares of pixels with a reading."""
     apparent_m: float = 0.0
-    """Sum of how long the hand looked."""
+    """Sum of how long the hand seemed, from wrist to middle fingertip, where anybody says."""
     nearest_m: float = math.inf
     farthest_m: float = -math.inf
 
-    def add_tracked(self, other_side: bool | None) -> None:
-        """One more frame that was not lost; other_side as in LostFrame."""
-        judged, other = other_side is not None, other_side is True
-        self.counts.update(frames=1, tracked_judged=judged, tracked_other_side=other)
-
-    def add_lost(self, frame: LostFrame) -> None:
-        """One more frame that was."""
-        self.counts.update(
-            frames=1,
-            lost=1,
-            out_of_reach=frame.within < _HARDLY <= frame.read,
-            too_near=frame.nearest_m < _TOO_NEAR_M,
-            with_hand=frame.hand_px > 0,
-            small=0 < frame.hand_px < _FEWEST_PX,
-            judged=frame.other_side is not None,
-            other_side=frame.other_side is True,
-            detections=frame.apparent_m is not None,
-        )
-        self.states[frame.state_name] += 1
-        self.read += frame.read
-        self.apparent_m += frame.apparent_m or 0.0
+    def add(self, more: RunFacts) -> None:
+        """More frames."""
+        self.counts.update(more.counts)
+        self.states.update(more.states)
+        self.read += more.read
+        self.apparent_m += more.apparent_m
         # Without readings both are NaN, which min and max pass over in this order.
-        self.nearest_m = min(self.nearest_m, frame.nearest_m)
-        self.farthest_m = max(self.farthest_m, frame.farthest_m)
+        self.nearest_m = min(self.nearest_m, more.nearest_m)
+        self.farthest_m = max(self.farthest_m, more.farthest_m)
 
     def mean_apparent_m(self) -> float | None:
         """How long the hand looked, where most of a run was lost and enough was seen to say so."""
@@ -105,30 +72,46 @@ class RunFacts:
         return self.apparent_m / count if mostly_lost and often_seen else None
 
 
+def tracked_frame(insight: StepInfo | None) -> RunFacts:
+    """The facts of a frame that was not lost."""
+    other = _other_side(insight)
+    judged = other is not None
+    return RunFacts(Counter(frames=1, tracked_judged=judged, tracked_other_side=other is True))
+
+
 def lost_frame(
     estimate: Estimate, depth_m: np.ndarray, insight: StepInfo | None, reach_m: float
-) -> LostFrame:
+) -> RunFacts:
     """The facts of a lost frame; depth_m (H, W) metres, beyond reach_m nothing is a hand."""
     step = max(1, round(math.sqrt(depth_m.size / _INSPECTED_PX)))
     few = depth_m[::step, ::step]
     readings = few[np.isfinite(few) & (few > 0)]
     nearest, farthest = np.percentile(readings, (2, 98)) if len(readings) else (np.nan, np.nan)
+    read = len(readings) / few.size
+    within = float(np.count_nonzero(readings <= reach_m)) / few.size
+    hand_px = 0 if insight is None else int(insight.observation.hand.sum())
+    other = _other_side(insight)
     detection = None if insight is None else insight.detection
-    return LostFrame(
-        state_name=estimate.state_name,
-        read=len(readings) / few.size,
-        within=float(np.count_nonzero(readings <= reach_m)) / few.size,
-        nearest_m=float(nearest),
-        farthest_m=float(farthest),
-        hand_px=0 if insight is None else int(insight.observation.hand.sum()),
-        other_side=_other_side(insight),
-        apparent_m=None
-        if detection is None or detection.present < _PRESENT
-        else detection.length_m,
+    apparent_m = 0.0
+    if detection is not None and detection.present >= _PRESENT:
+        apparent_m = detection.length_m
+    counts = Counter(
+        frames=1,
+        lost=1,
+        out_of_reach=within < _HARDLY <= read,
+        too_near=bool(nearest < _TOO_NEAR_M),
+        with_hand=hand_px > 0,
+        small=0 < hand_px < _FEWEST_PX,
+        judged=other is not None,
+        other_side=other is True,
+        detections=apparent_m > 0,
     )
+    states = Counter([estimate.state_name])
+    return RunFacts(counts, states, read, apparent_m, float(nearest), float(farthest))
 
 
 def _other_side(insight: StepInfo | None) -> bool | None:
+    """Whether it looks rather like the other hand; None where nobody says."""
     features = None if insight is None else insight.features
     # Minus the log of the probability that it is this side.
     return None if features is None else features.other_side > math.log(2)
@@ -157,14 +140,12 @@ class Watch:
         for slot, (estimate, insight) in enumerate(zip(estimates, insights, strict=True)):
             if vacant[slot] and (slot > 0 or not all(vacant)):
                 continue
-            gathered = self.facts[slot], self._stretch[slot]
             if estimate.lost:
                 frame = lost_frame(estimate, depth_m, insight, self.reach_m)
-                for facts in gathered:
-                    facts.add_lost(frame)
             else:
-                for facts in gathered:
-                    facts.add_tracked(_other_side(insight))
+                frame = tracked_frame(insight)
+            self.facts[slot].add(frame)
+            self._stretch[slot].add(frame)
         self._seen += 1
         if _FEWEST_FRAMES <= self._seen < _STRETCH:
             self.recent = self._stretch
