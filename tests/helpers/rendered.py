@@ -15,7 +15,7 @@ from toftrack.detector.detection import NO_DETECTION, Detection
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.model_image import model_range_image
-from toftrack.tracking.candidates import View, image_term
+from toftrack.tracking.candidates import View
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
@@ -105,6 +105,5 @@ def view_of(
     fitted = model.hand(track.side, track.shape)
     expected = expected_of(detection_of(track.pose))
     seen = model.segmentation(image.depth_m, image.k, expected)
-    term = image_term(seen, fitted, model)
     at = expected.nearest_m
-    return View(track, fitted, seen, at, detection, others, term, model, model.posterior)
+    return View(track, fitted, seen, at, detection, others, model, model.posterior)

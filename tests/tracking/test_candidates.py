@@ -21,12 +21,12 @@ from toftrack.tracking.candidates import (
     _MARGIN,
     Hypotheses,
     View,
-    as_last_seen,
     best_start,
     hypotheses_of,
     propose,
     select,
     with_own_arm,
+    with_parts,
     without_things,
 )
 from toftrack.tracking.model import TrackerModel
@@ -172,11 +172,11 @@ def test_a_thing_in_the_hand_is_neither_hand_nor_background() -> None:
 def test_what_was_a_thing_at_the_last_look_is_left_out_until_the_next() -> None:
     _, rest = seen_with(HALF_A_THING)
     view = view_of(image_of(hand_at()), track_of(hand_at(), parts=parts_of(HALF_A_THING)))
-    seen = as_last_seen(view).observation
+    seen = with_parts(view).observation
     assert rest.thing is not None and seen.thing is not None
     assert torch.equal(seen.hand, rest.hand) and torch.equal(seen.thing, rest.thing)
     plain = view_of(image_of(hand_at()), track_of(hand_at()))
-    assert as_last_seen(plain) is plain
+    assert with_parts(plain) is plain
 
 
 def test_without_a_thing_all_stays_as_it_is() -> None:

@@ -35,15 +35,17 @@ IMAGE = image_of(HERE, THERE)
 def filtered(view: View, **changes: Any) -> ParticleSet:
     """The particles of the only track, which the slot shows."""
     state = replace(state_of(view.track), **changes)
-    return filter_tracks([view], state, FRAME_S, view.model, 0, Spans())[view.track.cloud]
+    scene = scene_of(view.track, image=IMAGE, model=view.model)
+    return filter_tracks([view], state, scene, 0, Spans())[view.track.cloud]
 
 
 def test_what_is_drawn_for_a_hand_does_not_depend_on_others() -> None:
     views = [view_of(IMAGE, replace(track_of(at), number=n)) for n, at in enumerate((HERE, THERE))]
-    state, model = state_of(*(view.track for view in views), hands=2), right_hand_model()
+    tracks = [view.track for view in views]
+    state, scene = state_of(*tracks, hands=2), scene_of(*tracks, image=IMAGE)
 
     def drawn(some: list[View]) -> list[ParticleSet]:
-        return list(filter_tracks(some, state, FRAME_S, model, 3, Spans()).values())
+        return list(filter_tracks(some, state, scene, 3, Spans()).values())
 
     both, (alone,) = drawn(views), drawn(views[1:])
     torch.testing.assert_close(both[1].particles, alone.particles, atol=0, rtol=0)
@@ -99,7 +101,7 @@ def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:
     hidden = replace(plain, observation=part)
     views = plain, seen, hidden
     after = [update_track(view, filtered(view), scene, Spans()).track for view in views]
-    assert [one.asked_s for one in after[:2]] == pytest.approx([0.1 + FRAME_S, 0.0])
+    assert [one.asked_s for one in after[:2]] == pytest.approx([0.1, 0.0])
     assert [one.nearest_m for one in after] == pytest.approx([0.0, 0.0, hidden.expected_m])
 
 
@@ -224,5 +226,5 @@ def test_time_goes_on_with_the_images_and_not_where_a_clock_goes_back() -> None:
 def test_what_hides_a_hand_is_not_expected_to_be_it() -> None:
     plain, behind = track_of(HERE), track_of(HERE, nearest_m=0.55)
     scene = scene_of(plain, behind, image=IMAGE)
-    free, hidden = (hand.depths.nearest_m for hand in scene.hands)
+    free, hidden = (hand.expected.nearest_m for hand in scene.hands)
     assert free < 0.5 and hidden == pytest.approx(0.55, abs=0.01)

@@ -38,12 +38,7 @@ def view(*others: torch.Tensor) -> View:
 def weighed(seen: View, coverage: float | None = None, **weights: float) -> np.ndarray:
     """(N,) log posteriors, only with the terms that are weighted here."""
     used = posterior_weights(**(NONE | weights))
-    seen = replace(
-        seen,
-        image=replace(seen.image, coverage=coverage),
-        weights=used,
-    )
-    return seen.log_posterior(poses()).numpy()
+    return replace(seen, coverage=coverage, weights=used).log_posterior(poses()).numpy()
 
 
 def added(seen: View, **weights: float) -> np.ndarray:

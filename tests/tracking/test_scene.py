@@ -113,7 +113,7 @@ def test_hands_are_predicted_where_they_move_to() -> None:
     velocity = torch.zeros_like(still.velocity)
     velocity[0] = 0.8
     scene = scene_of(still, replace(still, velocity=velocity), image=BOTH)
-    here, moved = (hand.palm_m[0] for hand in scene.hands)
+    here, moved = (hand.palm_m for hand in scene.hands)
     assert here == pytest.approx(detection_of(hand_at()).centre_m.numpy(), abs=0.01)
     assert 0.2 * 0.8 * scene.dt_s < moved[0] - here[0] <= 0.8 * scene.dt_s
     assert moved[1:] == pytest.approx(here[1:], abs=1e-3)

@@ -71,22 +71,23 @@ def test_the_place_of_the_body_counts_beside_what_the_user_said() -> None:
 
 
 @pytest.mark.parametrize(
-    ("track", "soon", "later"),
+    ("track", "due"),
     [
-        (known(), True, True),
-        (known(age_s=0.0), False, True),
-        (known(4.0, comparisons=9, age_s=0.0), False, False),
-        (known(4.0, comparisons=1, age_s=0.0), False, True),
-        (known(4.0, comparisons=9), True, True),
-        (known(age_s=1.0, log_odds=-3.0), False, False),
-        (known(age_s=1.0, log_odds=-3.0, confirmed=False), True, True),
+        (known(), True),
+        (known(age_s=FRAME_S), False),
+        (known(age_s=0.2), True),
+        (known(4.0, comparisons=9, age_s=0.2), False),
+        (known(4.0, comparisons=1, age_s=0.2), True),
+        (known(4.0, comparisons=9), True),
+        (known(age_s=1.0, log_odds=-3.0), False),
+        (known(age_s=1.0, log_odds=-3.0, confirmed=False), True),
     ],
-    ids=["never", "just", "sure", "new", "sure, never", "hardly a hand", "not believed yet"],
+    ids=["never", "just", "later", "sure", "new", "sure, never", "hardly a hand", "not believed"],
 )
 def test_sides_are_compared_now_and_then_and_seldom_when_they_are_sure(
-    track: Track, soon: bool, later: bool
+    track: Track, due: bool
 ) -> None:
-    assert (comparison_due(track, FRAME_S), comparison_due(track, 0.2)) == (soon, later)
+    assert comparison_due(track) == due
 
 
 def compared(side: str, image_side: str, **evidence: float) -> SideEvidence:

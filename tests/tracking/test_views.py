@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
@@ -20,9 +19,6 @@ from helpers.rendered import (
 )
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.crops import crop_rotation
-from toftrack.detector.network import PARTS
-from toftrack.detector.parts import THING_PART, Parts
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
@@ -61,7 +57,7 @@ def off_m(view: View, pose: torch.Tensor) -> float:
 
 
 def gone_on(
-    found: SideDetection | None,
+    found: SideDetection,
     image: DepthImage = BOTH,
     told: str | None = None,
     **changes: object,
@@ -71,19 +67,12 @@ def gone_on(
     return continue_track(scene, 0, predicted_view(scene, 0), found, told)
 
 
-@pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
-def test_a_track_goes_on_where_it_is_predicted(found: SideDetection | None) -> None:
+@pytest.mark.parametrize("found", [seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
+def test_a_track_goes_on_where_it_is_predicted(found: SideDetection) -> None:
     view = gone_on(found)
     assert view is not None and view.track.age == Duration(1.0)
-    assert view.detection.empty == (found is None)
+    assert view.detection is found.detection
     torch.testing.assert_close(view.track.pose, HERE)
-
-
-def test_what_was_a_thing_in_the_hand_is_one_until_the_network_looks_again() -> None:
-    wrist = detection_of(HERE).keypoints.points_m[9].double().numpy()
-    kind = np.full((PARTS, PARTS), THING_PART, np.uint8)
-    view = gone_on(None, parts=Parts(kind, crop_rotation(wrist), wrist, False))
-    assert view is not None and view.observation.thing is not None
 
 
 def test_a_track_that_was_seen_elsewhere_begins_anew_there_and_is_the_same_hand() -> None:
@@ -102,14 +91,17 @@ def test_a_track_elsewhere_is_tentative_unless_it_was_believed_until_then(
     assert view is not None and view.track.confirmed == (believed_s == 0)
 
 
-@pytest.mark.parametrize("found", [None, seen(HERE, row=0), seen(THERE)])
-def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: SideDetection | None) -> None:
+@pytest.mark.parametrize("found", [seen(HERE, row=0), seen(THERE)])
+def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: SideDetection) -> None:
     assert gone_on(found, EMPTY) is None
 
 
-def test_the_time_since_a_comparison_goes_on() -> None:
-    view = gone_on(None, evidence=SideEvidence(1.0, age_s=0.3))
-    assert view is not None and view.track.evidence.age_s == pytest.approx(0.34)
+def test_the_time_since_a_comparison_and_since_the_last_look_goes_on() -> None:
+    track = track_of(HERE, asked_s=0.1, evidence=SideEvidence(1.0, age_s=0.3))
+    view = predicted_view(scene_of(track, image=BOTH, model=model()), 0)
+    assert view is not None and view.detection.empty
+    assert view.track.evidence.age_s == pytest.approx(0.34)
+    assert view.track.asked_s == pytest.approx(0.14)
 
 
 def of_both(side: str = "right") -> SideDetection:

@@ -62,7 +62,7 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
         for column, one in enumerate(seen):
             if one.row != row and (one.row >= 0 or one.side != hand.track.side):
                 continue
-            away = float(np.linalg.norm(one.detection.centre_m.numpy() - hand.palm_m[0])) / sigma
+            away = float(np.linalg.norm(one.detection.centre_m.numpy() - hand.palm_m)) / sigma
             if one.row == row or away < _GATE:
                 cost[row, column] = 0.5 * away**2 - merit(one.detection, one.detection.heat)
     return cost
@@ -181,7 +181,7 @@ def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerMode
         if track_ends(track, confirmed > track.confirmed, model.lost.patience)
     }
     hands = [model.hand(track.side, track.shape) for track in tracks]
-    palms = [palm_of(track.pose, hand)[0][0] for track, hand in zip(tracks, hands, strict=True)]
+    palms = [palm_of(track.pose, hand)[0] for track, hand in zip(tracks, hands, strict=True)]
     # Any confirmed track is surer than any tentative one.
     sureness = [track.log_odds + 20.0 * track.confirmed for track in tracks]
     surest = sorted(range(len(tracks)), key=lambda row: sureness[row], reverse=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache, partial
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import out_of_sight
-from toftrack.tracking.model import FilterModel, FittedHand, TrackerModel
+from toftrack.tracking.model import FittedHand, TrackerModel
 from toftrack.tracking.posterior import ImageTerm, PosteriorWeights, keypoints_off, touching
 from toftrack.tracking.state import Track
 
@@ -64,8 +64,8 @@ class View:
     fitted: the hand in the applied shape.  observation: not empty.
     expected_m: the depth of its nearest joint, as predicted, or as detected where it (re)starts.
     detection: empty where the pose network did not look.
-    others: joints (21, 3) m of each other hand.  image: the likelihood of the image.
-    weights: of the posterior's terms.
+    others: joints (21, 3) m of each other hand.
+    weights: of the posterior's terms.  coverage: see ImageTerm.
     """
 
     track: Track
@@ -74,9 +74,14 @@ class View:
     expected_m: float
     detection: Detection
     others: tuple[Tensor, ...]
-    image: ImageTerm
     model: TrackerModel
     weights: PosteriorWeights
+    coverage: float | None = None
+
+    @cached_property
+    def image(self) -> ImageTerm:
+        """The likelihood of the image."""
+        return ImageTerm(self.model, self.observation, self.fitted.scorer, self.coverage)
 
     @cached_property
     def hidden(self) -> bool:
@@ -127,33 +132,19 @@ class View:
 
 
 def with_parts(view: View) -> View:
-    """The view with its pixels told apart by the pose network: a thing's in the hand are no more
-    the hand's, and where it is hidden those of its own arm are, instead of its occluder's.
+    """The view with its pixels told apart by the pose network: those of a thing in the hand no
+    longer count as the hand's; where the hand is hidden, those of its own arm count as the hand's
+    instead of its occluder's.
+
+    Without a detection, the network's last look at the track tells the thing's pixels: in the hand
+    it hardly moves from frame to frame.
     """
-    seen = without_things(view.observation, view.detection.parts)
-    if view.hidden and view.detection.present >= _SURELY_PRESENT:
-        seen = with_own_arm(seen, view.detection)
-    if seen is view.observation:
-        return view
-    return replace(view, observation=seen, image=image_term(seen, view.fitted, view.model))
-
-
-def as_last_seen(view: View) -> View:
-    """A predicted view without the pixels that the network's last look at the track's hand called a
-    thing's: in the hand it hardly moves from frame to frame.
-    """
-    seen = without_things(view.observation, view.track.parts)
-    if seen is view.observation:
-        return view
-    return replace(view, observation=seen, image=image_term(seen, view.fitted, view.model))
-
-
-def image_term(
-    observation: Observation, fitted: FittedHand, model: FilterModel, coverage: float | None = None
-) -> ImageTerm:
-    """The likelihood of an observation, which must not be empty.  coverage: see ImageTerm."""
-    evidence = partial(model.evidence, observation)
-    return ImageTerm(model.likelihood, fitted.scorer, evidence, model.device, coverage)
+    detection = view.detection
+    parts = view.track.parts if detection.empty else detection.parts
+    seen = without_things(view.observation, parts)
+    if detection.present >= _SURELY_PRESENT and view.hidden:
+        seen = with_own_arm(seen, detection)
+    return view if seen is view.observation else replace(view, observation=seen)
 
 
 def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: float) -> Keypoints:

@@ -85,7 +85,7 @@ def finish_detection(
     places = pending.finder() if pending.at_once else state.places
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
-    believed = [] if rare else [hand.palm_m[0] for hand in scene.hands if hand.track.reliable]
+    believed = [] if rare else [hand.palm_m for hand in scene.hands if hand.track.reliable]
     places = _apart_from(believed, places)
     found = _elsewhere(scene, state, places, rare) if len(places.centre_m) else []
     arms = _arms(scene, seen) if found and not rare else []
@@ -101,7 +101,7 @@ def rests(scene: Scene, row: int, state: TrackerState) -> bool:
     third frame.
     """
     track = scene.hands[row].track
-    waited = Duration(track.asked_s + scene.dt_s).reached(_UNSHOWN)
+    waited = Duration(track.asked_s).reached(_UNSHOWN)
     return not state.shows(track) and not waited and _is_sure(scene, row)
 
 
@@ -114,10 +114,9 @@ def _is_asked(scene: Scene, row: int, state: TrackerState) -> bool:
     """Whether the pose network looks at a track; it skips frames of sure ones."""
     if rests(scene, row, state):
         return False
-    track, settings = scene.hands[row].track, scene.model.detector.settings
-    every = settings.every
-    waited = every == 1 or Duration(track.asked_s + scene.dt_s).reached(every)
-    return not _is_sure(scene, row) or waited or comparison_due(track, scene.dt_s)
+    track, every = scene.hands[row].track, scene.model.detector.settings.every
+    waited = every == 1 or Duration(track.asked_s).reached(every)
+    return not _is_sure(scene, row) or waited or comparison_due(track)
 
 
 def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
@@ -125,12 +124,12 @@ def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
     side's where a comparison is due.
     """
     hand, image = scene.hands[row], scene.image_for(row)
-    at = image.depth_m, image.k, hand.palm_m[0]
+    at = image.depth_m, image.k, hand.palm_m
     side, start = hand.track.side, scene.model.detector.start
-    wait = start(*at, side, hand.up_m[0])
-    if not comparison_due(hand.track, scene.dt_s):
+    wait = start(*at, side, hand.up_m)
+    if not comparison_due(hand.track):
         return lambda: SideDetection(wait(), side, row)
-    mirrored = start(*at, OTHER_SIDE[side], hand.up_m[0])
+    mirrored = start(*at, OTHER_SIDE[side], hand.up_m)
     return lambda: SideDetection(wait(), side, row, mirrored())
 
 
@@ -153,7 +152,7 @@ def _elsewhere(
     seen: list[SideDetection] = []
     for side in sorted(missing, reverse=True):  # right first
         # A hand that is hardly seen may look like one of the other side.
-        others = [hand.palm_m[0] for hand in scene.hands if hand.track.side != side and not rare]
+        others = [hand.palm_m for hand in scene.hands if hand.track.side != side and not rare]
         there = _apart_from(others, places)
         if len(there.centre_m):
             image = scene.image if rare else scene.unexplained
@@ -177,7 +176,7 @@ def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]
     looked = {one.row for one in seen}
     for row, hand in enumerate(scene.hands):
         if row not in looked and hand.track.reliable:
-            along = -hand.up_m[0] / max(float(np.linalg.norm(hand.up_m[0])), 1e-6)
+            along = -hand.up_m / max(float(np.linalg.norm(hand.up_m)), 1e-6)
             arms.append(((hand.joints_m[0].numpy(), along), math.inf))
     return arms
 

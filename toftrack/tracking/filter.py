@@ -43,10 +43,11 @@ def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Ten
 class PredictedHand:
     """A track's hand as it is predicted in a frame.
 
-    pose: (1, 27).  joints_m: (21, 3).  up_m: (1, 3) from its wrist to the palm's middle.
-    palm_m: (1, 3) the palm's middle, by the hand's own length: the nearer to it a crop is centred,
+    track: as the last frame left it, but for `asked_s` and `evidence`, which are as of this frame.
+    pose: (1, 27).  joints_m: (21, 3).  up_m: (3,) from its wrist to the palm's middle.
+    palm_m: (3,) the palm's middle, by the hand's own length: the nearer to it a crop is centred,
         the more exact are the poses that the network sees there.
-    depths: where it is to be segmented.
+    expected: where it is to be segmented.
     """
 
     track: Track
@@ -55,7 +56,7 @@ class PredictedHand:
     joints_m: Tensor
     palm_m: np.ndarray
     up_m: np.ndarray
-    depths: Expected
+    expected: Expected
 
 
 def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
@@ -71,16 +72,18 @@ def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
     # hand: while something hides the hand, it comes nearer only as its middle does.
     approach = _APPROACH_M_S * dt_s + max(0.0, -float(moved[2]))
     nearest = max(nearest, track.nearest_m - approach)
-    depths = Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
-    return PredictedHand(track, fitted, pose, joints, palm, up, depths)
+    expected = Expected(nearest, farthest, tuple(joints.mean(0).tolist()))
+    evidence = changed(track.evidence, age_s=track.evidence.age_s + dt_s)
+    track = changed(track, asked_s=track.asked_s + dt_s, evidence=evidence)
+    return PredictedHand(track, fitted, pose, joints, palm, up, expected)
 
 
 def palm_of(pose: Tensor, fitted: FittedHand) -> tuple[np.ndarray, np.ndarray]:
-    """(1, 3) m, the middle of the palm in a pose (1, 27); and from the wrist to it."""
-    wrist = pose[:, :6].numpy()
-    up = np.float32(fitted.ratio) * pivot_offset(wrist[:, 3:6])
-    palm = wrist[:, :3] + up
-    palm[:, 2] = np.maximum(palm[:, 2], _NEAREST_M)
+    """(3,) m, the middle of the palm in a pose (1, 27); and (3,) m from the wrist to it."""
+    wrist = pose[0, :6].numpy()
+    up = np.float32(fitted.ratio) * pivot_offset(wrist[None, 3:])[0]
+    palm = wrist[:3] + up
+    palm[2] = max(palm[2], _NEAREST_M)
     return palm, up
 
 

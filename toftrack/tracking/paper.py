@@ -25,10 +25,10 @@ from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.regions import joint_axes
 from toftrack.render.segmentation import Observation
-from toftrack.tracking.candidates import image_term
 from toftrack.tracking.confidence import Status
 from toftrack.tracking.filter import predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
+from toftrack.tracking.posterior import ImageTerm
 from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
 from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState, changed
 from toftrack.tracking.step import StepResult
@@ -157,7 +157,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
     (slot,), track = state.slots, state.tracks[0] if state.tracks else None
     fitted, sure = model.hand(slot.side, slot.shape), 1.0 if state.told else 0.5
     with spans("segmentation and evidence"):
-        expected = predict(track, dt_s, model).depths if track else None
+        expected = predict(track, dt_s, model).expected if track else None
         observation = model.segmentation(image.depth_m, image.k, expected)
         if observation.empty:
             slot, estimate = report_absence(slot, image, model, 1)
@@ -165,7 +165,7 @@ def paper_step(state: TrackerState, image: DepthImage, model: PaperModel) -> Ste
             none = torch.zeros(0, 6 + model.space.dims, device=model.device)
             info = StepInfo(observation, none, none[:, 0], spans.seconds())
             return changed(state, slots=(slot,)), (info,), (estimate,)
-        likelihood = image_term(observation, fitted, model)
+        likelihood = ImageTerm(model, observation, fitted.scorer)
     with spans("start"):
         track = track or model.start(observation, model, generator)
     with spans("filter: rest"):

@@ -8,8 +8,8 @@ are compared by it; the filter weighs its particles by the image alone, sharpene
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -20,8 +20,12 @@ from toftrack.compute.rigid_numba import distance
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.errors import check_number
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.render.likelihood import Likelihood, checked_score
+from toftrack.render.likelihood import checked_score
 from toftrack.render.scoring import Counts, Evidence, Scorer
+from toftrack.render.segmentation import Observation
+
+if TYPE_CHECKING:
+    from toftrack.tracking.model import FilterModel
 
 _FAR_SIGMAS = 3.0
 """Scale, in standard deviations, from which on farther joints hardly cost more."""
@@ -48,33 +52,35 @@ class PosteriorWeights:
 
 @dataclass(frozen=True, eq=False)
 class ImageTerm:
-    """The likelihood of the image: the log of the F-measure, and of how much is explained.
+    """The likelihood of an observation: the log of the F-measure, and of how much is explained.
 
-    evidence_of: makes the evidence, on the scorer's device, when it is first asked for.
+    observation: not empty.  scorer: of the hand in its shape.
     coverage: weight of how much is explained; None = the likelihood's own.
     """
 
-    likelihood: Likelihood
+    model: FilterModel
+    observation: Observation
     scorer: Scorer
-    evidence_of: Callable[[], Evidence]
-    device: torch.device
     coverage: float | None = None
 
     @property
     def evidence(self) -> Evidence:
-        """What poses are compared with."""
-        return self.evidence_of()
+        """What poses are compared with, on the particles' device; made when first asked for."""
+        return self.model.evidence(self.observation)
 
     def __call__(self, poses: Tensor) -> Tensor:
-        """(N,) log values of poses (N, 27), all on the CPU."""
-        return self.likelihood.log_score(self._counts(poses), self.coverage)
+        """(N,) log likelihoods of poses (N, 27), all on the CPU."""
+        return self.model.likelihood.log_score(self._counts(poses), self.coverage)
 
     def score(self, pose: Tensor) -> float:
-        """The F-measure, 0 .. 1, of a pose (1, 27); ToftrackError where it is none."""
-        return float(checked_score(self.likelihood, self._counts(pose)))
+        """The F-measure, 0 .. 1, of a pose (1, 27).
+
+        Raises ToftrackError where a likelihood of somebody else returns no such number.
+        """
+        return float(checked_score(self.model.likelihood, self._counts(pose)))
 
     def _counts(self, poses: Tensor) -> Counts:
-        return Counts(*on_host(*self.scorer(on_device(poses, self.device), self.evidence)))
+        return Counts(*on_host(*self.scorer(on_device(poses, self.model.device), self.evidence)))
 
 
 def keypoints_off(joints_m: Tensor, keypoints: Keypoints) -> Tensor:

@@ -75,12 +75,12 @@ def side_log_odds(track: Track, tracks: Sequence[Track], told: str | None) -> fl
     return total - (1.0 - alone) * _PARTNER * partner
 
 
-def comparison_due(track: Track, dt_s: float) -> bool:
-    """Whether a track's sides are to be compared in a frame that comes dt_s after its last one."""
+def comparison_due(track: Track) -> bool:
+    """Whether a frame is to compare the sides of a track, whose evidence is as of that frame."""
     if track.confirmed and track.log_odds < _LEAST_LOG_ODDS:
         return False
     known = abs(track.evidence.fits) > _SURE and track.evidence.comparisons >= _FIRST
-    return track.evidence.age_s + dt_s >= (_SURE_S if known else _UNSURE_S)
+    return track.evidence.age_s >= (_SURE_S if known else _UNSURE_S)
 
 
 def compare_sides(view: View, mirrored: Detection, image: DepthImage, arm: Arm) -> SideEvidence:
@@ -115,9 +115,8 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
     """The log posterior of the best pose of a detection as a hand of `side`."""
     fitted = view.model.hand(side, view.track.shape)
     # Very different poses are compared: what explains more of the image counts in full.
-    image = replace(view.image, scorer=fitted.scorer, coverage=1.0)
     weights = replace(view.weights, keypoints=_KEYPOINTS)
-    seen = replace(view, fitted=fitted, detection=detection, image=image, weights=weights)
+    seen = replace(view, fitted=fitted, detection=detection, weights=weights, coverage=1.0)
     return max(best_start(seen)[1], WORST)
 
 

@@ -49,10 +49,6 @@ class SideEvidence:
     comparisons: int = 0
     age_s: float = math.inf
 
-    def later(self, dt_s: float) -> SideEvidence:
-        """The same evidence after dt_s without a comparison."""
-        return changed(self, age_s=self.age_s + dt_s)
-
 
 @dataclass(frozen=True, eq=False)
 class ParticleSet:

@@ -16,7 +16,7 @@ from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
 from toftrack.tracking.association import associate, keep_tracks
-from toftrack.tracking.candidates import View, as_last_seen, propose, select
+from toftrack.tracking.candidates import View, propose, select, with_parts
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
@@ -63,28 +63,28 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         scene = Scene.of(state.tracks, image, dt_s, model)
         rows = range(len(scene.hands))
         pending = start_detection(scene, state)
-        predicted = [
-            None if rests(scene, row, state) else predicted_view(scene, row) for row in rows
-        ]
+        resting = [rests(scene, row, state) for row in rows]
+        predicted = [None if resting[row] else predicted_view(scene, row) for row in rows]
     with spans("filter: rest"):
         seed = int(torch.randint(2**62, (1,), generator=generator))
-        expected = [as_last_seen(view) for view in predicted if view is not None]
-        filtered = filter_tracks(expected, state, dt_s, model, seed, spans)
+        expected = [view and with_parts(view) for view in predicted]
+        filtered = filter_tracks([view for view in expected if view], state, scene, seed, spans)
     with spans("detector"):
         detections = finish_detection(pending, scene, state)
         found, new = associate(scene.hands, detections, dt_s)
         continued = [
-            continue_track(scene, row, predicted[row], found[row], state.told) for row in rows
+            continue_track(scene, row, predicted[row], seen, state.told) if seen else expected[row]
+            for row, seen in enumerate(found)
         ]
         numbered = list(enumerate(new[: max_new_tracks(state)], state.next_track))
         begun = [begin_track(scene, one, number, state) for number, one in numbered]
         views = [view for view in continued + begun if view is not None]
     with spans("filter: rest"):
         moved = [view for view in views if view.track.cloud not in filtered]
-        filtered |= filter_tracks(moved, state, dt_s, model, seed, spans)
+        filtered |= filter_tracks(moved, state, scene, seed, spans)
     results = [update_track(view, filtered[view.track.cloud], scene, spans) for view in views]
     unseen = [
-        rest_track(scene, row) if rests(scene, row, state) else miss_track(scene, row)
+        rest_track(scene, row) if resting[row] else miss_track(scene, row)
         for row in rows
         if continued[row] is None
     ]
@@ -110,8 +110,6 @@ def rest_track(scene: Scene, row: int) -> Track:
         cloud=predict_particles(track, dt_s, scene.model),
         pose=hand.pose,
         age=track.age.extended(dt_s),
-        asked_s=track.asked_s + dt_s,
-        evidence=track.evidence.later(dt_s),
     )
 
 
@@ -129,18 +127,14 @@ def miss_track(scene: Scene, row: int) -> Track:
 
 
 def filter_tracks(
-    views: Sequence[View],
-    state: TrackerState,
-    dt_s: float,
-    model: TrackerModel,
-    seed: int,
-    spans: Spans,
+    views: Sequence[View], state: TrackerState, scene: Scene, seed: int, spans: Spans
 ) -> dict[ParticleSet, ParticleSet]:
-    """What becomes of the particles of tracks: filtered if a slot shows them or they are doubtful,
-    else moved on.
+    """The particles of each view's track in this frame, by those of the last one: filtered if a
+    slot shows the track or it is not reliable, else moved on.
 
     What is drawn for a track depends on its number, not on which others there are.
     """
+    dt_s, model = scene.dt_s, scene.model
     chosen = [state.shows(view.track) or not view.track.reliable for view in views]
     filtered = list(compress(views, chosen))
     tracks, images = [view.track for view in filtered], [view.image for view in filtered]
@@ -190,7 +184,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         whole_odds=status.whole_odds,
         confirmed=track.confirmed or believed,
         believed_s=0.0 if believed else track.believed_s + dt_s,
-        asked_s=track.asked_s + dt_s if view.detection.empty else 0.0,
+        asked_s=track.asked_s if view.detection.empty else 0.0,
         parts=track.parts if view.detection.empty else view.detection.parts,
         features=features,
         nearest_m=view.expected_m if view.hidden else 0.0,

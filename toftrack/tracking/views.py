@@ -14,14 +14,7 @@ from toftrack.refinement import shape_fit
 from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.association import SideDetection
-from toftrack.tracking.candidates import (
-    View,
-    as_last_seen,
-    best_start,
-    image_term,
-    with_parts,
-    without_things,
-)
+from toftrack.tracking.candidates import View, best_start, with_parts, without_things
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
@@ -34,37 +27,26 @@ _SPARE = 1
 
 def predicted_view(scene: Scene, row: int) -> View | None:
     """The view of a track where it is predicted, without detection; None where no hand can be."""
-    return make_view(scene, row, _later(scene, row), NO_DETECTION, scene.hands[row].depths)
-
-
-def _later(scene: Scene, row: int) -> Track:
-    """The track of a row, with the time since its sides were compared as of this frame."""
-    track = scene.hands[row].track
-    return changed(track, evidence=track.evidence.later(scene.dt_s))
+    return make_view(scene, row, scene.hands[row].track, NO_DETECTION)
 
 
 def continue_track(
-    scene: Scene, row: int, view: View | None, seen: SideDetection | None, told: str | None
+    scene: Scene, row: int, view: View | None, seen: SideDetection, told: str | None
 ) -> View | None:
-    """The `view` of a track with its detection, if it has one; None where no hand can be.
+    """The predicted `view` of a track with the detection of its hand; None where no hand can be.
 
     The track restarts where the finder's detection is elsewhere, or the other side is likelier.
     """
-    if seen is None:  # what is in the hand hardly moves until the network looks again
-        return view and as_last_seen(view)
-    detection, palm = seen.detection, scene.hands[row].palm_m[0]
-    away = float(np.linalg.norm(detection.centre_m.numpy() - palm))
+    detection, hand = seen.detection, scene.hands[row]
+    away = float(np.linalg.norm(detection.centre_m.numpy() - hand.palm_m))
     moved = seen.row < 0 and away > SAME_PLACE_M
     if moved:
-        view = make_view(scene, row, _later(scene, row), detection, expected_of(detection))
+        view = make_view(scene, row, hand.track, detection)
     if view is None:
         return None
-    view = replace(
-        view, detection=detection, track=update_shape(view.track, detection, scene.model)
-    )
-    if moved:
-        view = replace(view, track=restart_track(view))
-    view = with_parts(view)
+    track = update_shape(view.track, detection, scene.model)
+    view = replace(view, detection=detection, track=track)
+    view = restarted(view) if moved else with_parts(view)
     if seen.mirrored is None:
         return view
     return choose_side(scene, row, view, seen.mirrored, told)
@@ -85,13 +67,12 @@ def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerSta
     cloud, pose = ParticleSet(nothing, nothing[:, 0], nothing), torch.zeros(1, 27)
     track = Track(cloud, nothing[0], pose, number=number, side=one.side, shape=shape)
     track = update_shape(track, detection, model)
-    view = make_view(scene, -1, track, detection, expected_of(detection))
+    view = make_view(scene, -1, track, detection)
     if view is None:
         return None
     at = detection.centre_m.numpy(), OTHER_SIDE[one.side], detection.up
     mirrored = model.detector.start(image.depth_m, image.k, *at)
-    view = with_parts(replace(view, track=restart_track(view)))
-    return choose_side(scene, -1, view, mirrored(), state.told)
+    return choose_side(scene, -1, restarted(view), mirrored(), state.told)
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
@@ -101,11 +82,12 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
     return next((slot.shape for slot in vacant), first_shape())
 
 
-def make_view(
-    scene: Scene, row: int, track: Track, detection: Detection, expected: Expected
-) -> View | None:
-    """The view of a track where it is expected, row -1 = a new one; None where no hand can be."""
+def make_view(scene: Scene, row: int, track: Track, detection: Detection) -> View | None:
+    """The view of a track where it is detected, or without a detection where it is predicted; None
+    where no hand can be.  row: of the track's prediction, -1 = of a new track.
+    """
     model = scene.model
+    expected = scene.hands[row].expected if detection.empty else expected_of(detection)
     observation = scene.segment(expected, row)
     if observation.empty:
         return None
@@ -117,7 +99,6 @@ def make_view(
         expected.nearest_m,
         detection,
         scene.others_joints(row),
-        image_term(observation, fitted, model),
         model,
         model.posterior,
     )
@@ -132,25 +113,22 @@ def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: s
         return replace(view, track=track)
     track = changed(track, side=OTHER_SIDE[track.side], shape=first_shape())
     track = update_shape(changed(track, age=Duration()), mirrored, scene.model)
-    other = make_view(scene, row, track, mirrored, expected_of(mirrored))
-    if other is None:
-        return view
-    return with_parts(replace(other, track=restart_track(other)))
+    other = make_view(scene, row, track, mirrored)
+    return view if other is None else restarted(other)
 
 
-def restart_track(view: View) -> Track:
-    """The track at the best pose of the view's detection, with age 0: still of the same hand.
+def restarted(view: View) -> View:
+    """The view with its track at the best pose of its detection, of age 0: still of the same hand.
 
     A track whose last estimate was not believed is tentative there: an elbow that the finder takes
     for a hidden hand must be as probable as a new hand to be believed.
     """
-    model, seen = view.model, without_things(view.observation, view.detection.parts)
+    seen = without_things(view.observation, view.detection.parts)
     # Very different poses are compared: what explains more of the image counts in full.
-    image = image_term(seen, view.fitted, model, coverage=1.0)
-    pose, _ = best_start(replace(view, observation=seen, image=image))
-    fresh, old = new_track(pose, model), view.track
-    return changed(
-        fresh,
+    pose, _ = best_start(replace(view, observation=seen, coverage=1.0))
+    old = view.track
+    track = changed(
+        new_track(pose, view.model),
         number=old.number,
         side=old.side,
         evidence=old.evidence,
@@ -158,6 +136,7 @@ def restart_track(view: View) -> Track:
         confirmed=old.reliable,
         believed_s=old.believed_s,
     )
+    return with_parts(replace(view, track=track))
 
 
 def update_shape(track: Track, detection: Detection, model: TrackerModel) -> Track:
