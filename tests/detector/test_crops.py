@@ -6,11 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from helpers.detection import (
-    channels,
-    intrinsics,
-    small_networks,
-)
+from helpers.detection import channels, intrinsics, small_networks
+from helpers.settings import detector_settings
 from helpers.tracking import sample
 
 from toftrack.compute.rigid import PIVOT_M
@@ -27,8 +24,9 @@ from toftrack.detector.crops import (
     wide,
 )
 from toftrack.detector.detection import Detection, doubted_sigma_m
+from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
-from toftrack.detector.proposals import KEPT, run_pose_network, start_finding
+from toftrack.detector.proposals import KEPT
 from toftrack.detector.weights import load_weights
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
@@ -89,7 +87,7 @@ def reference(
     side: str,
     up: np.ndarray | None,
 ) -> dict[str, torch.Tensor]:
-    """What run_pose_network says, by PoseNet.decode of the reference's crops."""
+    """What HandDetector.detect says, by PoseNet.decode of the reference's crops."""
     flip = np.array([-1.0 if side == "left" else 1.0, 1.0, 1.0])
     mirror, mirror_turn = torch.from_numpy(flip).float(), torch.from_numpy(flip[[1, 0, 0]]).float()
     if side == "left":  # as a mirror shows it
@@ -190,13 +188,14 @@ def distinct(log_probability: torch.Tensor) -> torch.Tensor:
 @pytest.mark.parametrize("network", ["trained", "random"])
 def test_the_compiled_crop_is_that_of_the_reference(side: str, network: str) -> None:
     """Of hands, of places at the border, and of places beside the image."""
-    pose = load_weights()[0] if network == "trained" else small_networks()[0]
+    networks = load_weights()[:2] if network == "trained" else small_networks()
+    detector = HandDetector(*networks, detector_settings())
     for frame in (0, 30, 60):
         scene = sample().cut(frame)
         centres = np.concatenate((scene.joints_m[0, [0, 9]], [[0.2, 0.0, 0.45], [2.0, 0.1, 0.3]]))
         up = np.random.default_rng(frame).normal(size=(4, 3)) if frame else None
-        reported = run_pose_network(pose, scene.depth_m[0], scene.k, centres, side, up)
-        expected = reference(pose, scene.depth_m[0], scene.k, centres, side, up)
+        reported = detector.detect(scene.depth_m[0], scene.k, centres, side, up)
+        expected = reference(networks[0], scene.depth_m[0], scene.k, centres, side, up)
         ordered = distinct(expected["log_probability"])
         for name, value in expected.items():
             if name == "parts":
@@ -234,13 +233,13 @@ def strange_images() -> dict[str, tuple[np.ndarray, np.ndarray]]:
 @pytest.mark.parametrize("side", ["right", "left"])
 def test_of_any_image_something_finite_is_said(name: str, side: str) -> None:
     depth, k = strange_images()[name]
-    pose, finder = small_networks()
     for least in (0.0, 0.5):
-        places = start_finding(finder, depth, k, 3, least)()
+        detector = HandDetector(*small_networks(), detector_settings(places=3, least=least))
+        places = detector.start_search(depth, k)()
         assert places.centre_m.shape == (len(places.probability), 3)
         assert len(places.probability) <= 3
         assert np.isfinite(places.centre_m).all() and (places.centre_m[:, 2] > 0).all()
-    for what, value in numbers(run_pose_network(pose, depth, k, np.array(PLACES), side)).items():
+    for what, value in numbers(detector.detect(depth, k, np.array(PLACES), side)).items():
         assert value.isfinite().all(), what
 
 
@@ -262,8 +261,9 @@ class SeesTwoPalms(Finder):
 
 @pytest.mark.parametrize(("apart_m", "places"), [(0.042, 2), (0.03, 1)])
 def test_palms_of_hands_that_touch_are_two_places(apart_m: float, places: int) -> None:
-    finder = SeesTwoPalms(apart_m)
-    found = start_finding(finder, sample().depth_m[0], sample().k, 3, 0.1)()
+    settings = detector_settings(places=3, least=0.1)
+    detector = HandDetector(small_networks()[0], SeesTwoPalms(apart_m), settings)
+    found = detector.start_search(sample().depth_m[0], sample().k)()
     assert len(found.probability) == places
     if places == 2:
         assert np.linalg.norm(found.centre_m[1] - found.centre_m[0]) == pytest.approx(apart_m)

@@ -12,8 +12,7 @@ from helpers.settings import detector_settings
 from helpers.tracking import sample
 
 from toftrack.compute.rigid import PIVOT_M
-from toftrack.detector import hand_detector as module
-from toftrack.detector.detection import Detection, doubted_sigma_m, merit
+from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.proposals import Places
 from toftrack.hand.shape import default_hand_shape
@@ -72,14 +71,13 @@ def looked(
 ) -> tuple[list[Detection], list[np.ndarray]]:
     """The hands at places, and where the pose network looked."""
     inspected: list[np.ndarray] = []
-    plain = module.run_pose_network
+    plain, scene = HandDetector.detect, sample()
 
-    def run_pose_network(pose, depth_m, k, centres_m, side, up=None):
+    def detect(self, depth_m, k, centres_m, *given):
         inspected.append(np.array(centres_m))
-        return plain(pose, depth_m, k, centres_m, side, up)
+        return plain(self, depth_m, k, centres_m, *given)
 
-    monkeypatch.setattr(module, "run_pose_network", run_pose_network)
-    scene = sample()
+    monkeypatch.setattr(HandDetector, "detect", detect)
     return detector(**changes).look(scene.depth_m[0], scene.k, places, "right"), inspected
 
 
@@ -100,8 +98,8 @@ def test_the_place_comes_first_of_which_most_speaks_for_a_hand(
 ) -> None:
     places = found_at((0, 0, 0.4), (0.2, 0, 0.5))
     hands, _ = looked(monkeypatch, places, merit=-1e6)
+    assert {round(one.heat, 2) for one in hands} == {0.9, 0.72}
     merits = [one.merit for one in hands]
-    assert merits == pytest.approx([merit(one, one.heat) for one in hands])
     assert merits == sorted(merits, reverse=True) and len(hands) == 2
     between = sum(merits) / 2
     assert len(looked(monkeypatch, places, merit=between)[0]) == 1, "the other may be none"
@@ -110,15 +108,15 @@ def test_the_place_comes_first_of_which_most_speaks_for_a_hand(
 
 def test_merit_rises_with_all_that_speaks_for_a_hand() -> None:
     seen = detection()
-    assert merit(seen, 0.9) > merit(seen, 0.3) > merit(seen, 0.0) > -math.inf
+    merits = [replace(seen, heat=heat).merit for heat in (0.9, 0.3, 0.0)]
+    assert merits == sorted(merits, reverse=True) and len(set(merits)) == 3
     for better in (
         {"present": min(1.0, 2 * seen.present)},
         {"right_side": min(1.0, 2 * seen.right_side)},
         {"error_m": seen.error_m / 2},
     ):
-        assert merit(replace(seen, **better), 0.5) > merit(seen, 0.5)
-    nothing = replace(seen, present=0.0, right_side=0.0)
-    assert math.isfinite(merit(nothing, 0.0))
+        assert replace(seen, **better).merit > seen.merit
+    assert math.isfinite(replace(seen, heat=0.0, present=0.0, right_side=0.0).merit)
 
 
 @pytest.mark.parametrize("known", [0, 3])

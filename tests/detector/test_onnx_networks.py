@@ -18,7 +18,6 @@ from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, digest, load_networks
-from toftrack.detector.proposals import run_pose_network
 from toftrack.detector.weights import DEFAULT_FILE, save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training import onnx_export
@@ -83,14 +82,14 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
     scene = sample().cut(30)
     centres = scene.joints_m[0, [0, 9]]
     for side in ("right", "left"):
-        found, expected = (
-            [
-                one.keypoints.points_m
-                for one in run_pose_network(network, scene.depth_m[0], scene.k, centres, side)
-            ]
+        seen = [
+            HandDetector(network, finder, detector_settings()).detect(
+                scene.depth_m[0], scene.k, centres, side
+            )
             for network in (pose, pose.reference)
-        )
-        away = (torch.stack(found) - torch.stack(expected)).norm(dim=-1).mean()
+        ]
+        found, expected = (torch.stack([one.keypoints.points_m for one in each]) for each in seen)
+        away = (found - expected).norm(dim=-1).mean()
         assert float(away) < (0.003 if side == "right" else 0.010), "of the other side it guesses"
     image, _ = wide(scene.depth_m[0], scene.k)
     with torch.no_grad():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -33,8 +34,7 @@ class Detection:
     keypoints: the joints, each with its standard deviation.
     present, right_side: probabilities that there is a hand, and that it is of the side looked for.
     parts: which of the pixels are the hand, and which a thing's that it holds.
-    heat, merit: of a place of a search, the finder's probability, and how much speaks for a hand
-        there with all that is known, log scale.
+    heat: the finder's probability of a hand there; 1 where the finder was not asked.
     """
 
     pivot_m: Tensor
@@ -49,7 +49,15 @@ class Detection:
     right_side: float
     parts: Parts = ALL_HAND
     heat: float = 1.0
-    merit: float = math.inf
+
+    @cached_property
+    def merit(self) -> float:
+        """How much speaks for a hand of the side that was looked for, log scale."""
+        odds = math.log(max(self.heat, 1e-6)) + math.log(max(self.present, 1e-6))
+        odds += 0.5 * math.log(max(self.right_side, 1e-3))
+        # How far off the pose network takes itself to be.
+        doubt_m = float(self.error_m[0]) + 0.5 * float(self.keypoints.sigma_m.mean())
+        return odds - doubt_m / _CLEAR_M
 
     def states(self, ratio: float, count: int | None = None) -> Tensor:
         """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle.
@@ -98,21 +106,6 @@ NO_DETECTION = Detection(
     right_side=0.5,
 )
 """Of a frame in which the network was not asked, or found no hand."""
-
-
-def merit(detection: Detection, heat: float) -> float:
-    """How much speaks for a hand of the side that is looked for at a place, log scale.
-
-    heat: the finder's probability.
-    """
-    odds = math.log(max(heat, 1e-6)) + math.log(max(detection.present, 1e-6))
-    odds += 0.5 * math.log(max(detection.right_side, 1e-3))
-    return odds - doubt_m(detection) / _CLEAR_M
-
-
-def doubt_m(detection: Detection) -> float:
-    """How far off the pose network takes itself to be, metres."""
-    return float(detection.error_m[0]) + 0.5 * float(detection.keypoints.sigma_m.mean())
 
 
 def doubted_sigma_m(points_m: Tensor, sigma_m: Tensor, hand_length_m: float) -> Tensor:

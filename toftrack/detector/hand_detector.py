@@ -4,20 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
 
-from toftrack.detector.detection import Detection, merit
-from toftrack.detector.network import Finder, PoseNet
+from toftrack.compute.threads import beside, run_shared
+from toftrack.compute.transfer import on_device, on_host
+from toftrack.detector.crops import wide
+from toftrack.detector.decoding_numba import decode_at
+from toftrack.detector.detection import Detection
+from toftrack.detector.network import Finder, Found, PoseNet
 from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet, load_networks
-from toftrack.detector.proposals import (
-    Places,
-    run_pose_network,
-    start_finding,
-    start_pose_network,
-)
+from toftrack.detector.proposals import Crop, Places, likely_places
 from toftrack.errors import check_number
 
 _AGAIN = 3.0
@@ -70,12 +70,28 @@ class HandDetector:
         side: str,
         up: np.ndarray | None = None,
     ) -> list[Detection]:
-        """What a hand of a side is like at each of C places (C, 3), in their order.
+        """What the pose network says of a hand of a side at each of C places (C, 3), in order.
 
-        depth_m: (H, W) rectified Z, 0 = no reading.  k: (3, 3).
-        up: (C, 3) where its fingers point, see proposals.run_pose_network; None = unknown.
+        depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
+        up: (C, 3) where the fingers point, as far as that is known, which is up in the crops, see
+            crops.crop_rotation; None: crops as the camera is held. The network knows hands better
+            that are upright, more or less.
         """
-        return run_pose_network(self.pose, depth_m, k, centres_m, side, up)
+        count, found = len(centres_m), dict[int, Detection]()
+        rows = iter(range(count))
+
+        def look() -> None:
+            """At the next place as long as there is one, which other threads may have taken.
+
+            At each by itself: a batch takes as long, and what is said of a crop would depend on
+            others.
+            """
+            for row in rows:
+                crop = Crop(depth_m, k, centres_m[row], side, None if up is None else up[row])
+                found[row] = crop.decode(self.pose.outputs(crop.image))
+
+        run_shared(look, count if self._may_be_shared else 1)
+        return [found[row] for row in range(count)]
 
     def start(
         self,
@@ -85,14 +101,29 @@ class HandDetector:
         side: str,
         up: np.ndarray | None = None,
     ) -> Callable[[], Detection]:
-        """The same at one place (3,), begun beside whatever does not need it."""
-        return start_pose_network(self.pose, depth_m, k, centre_m, side, up)
+        """The same at one place (3,), `up` (3,), begun in another thread if there may be one; what
+        is returned waits for it.
+
+        That thread has nothing to do but the network, so that it hardly needs the interpreter's
+        lock.
+        """
+        crop = Crop(depth_m, k, centre_m, side, up)
+        look = partial(self.pose.outputs, crop.image)
+        wait = beside(look) if self._may_be_shared else look
+        return lambda: crop.decode(wait())
+
+    @property
+    def _may_be_shared(self) -> bool:
+        """Whether other threads may run the pose network: torch has threads of its own, and needs
+        the lock.
+        """
+        return isinstance(self.pose, OnnxPoseNet) and decode_at.is_compiled
 
     def look(
         self, depth_m: np.ndarray, k: np.ndarray, places: Places, side: str
     ) -> list[Detection]:
-        """Hands of a side at places of the finder, the best first; those that may be none are left
-        out, by the `merit` of the settings.
+        """Hands of a side at places of the finder, that of the largest merit first; those without
+        the least `merit` of the settings are left out.
 
         At the better places poses are proposed twice, the second time about the palm that was found
         with its fingers upright: they are the more exact the nearer the crop's centre is to the
@@ -100,26 +131,33 @@ class HandDetector:
         """
         least = self.settings.merit
         first = self.detect(depth_m, k, places.centre_m, side)
-        both = zip(first, places.probability, strict=True)
-        good = [(one, float(heat)) for one, heat in both if merit(one, heat) > least - _AGAIN]
-        again = np.array([one.centre_m.numpy() for one, _ in good]).reshape(-1, 3)
-        up = np.array([one.up for one, _ in good]).reshape(-1, 3)
-        found = [
-            replace(one, heat=heat, merit=merit(one, heat))
-            for one, (_, heat) in zip(self.detect(depth_m, k, again, side, up), good, strict=True)
-        ]
+        both = zip(first, places.probability.tolist(), strict=True)
+        seen = [replace(one, heat=heat) for one, heat in both]
+        good = [one for one in seen if one.merit > least - _AGAIN]
+        palms = np.array([one.centre_m.numpy() for one in good]).reshape(-1, 3)
+        up = np.array([one.up for one in good]).reshape(-1, 3)
+        again = zip(self.detect(depth_m, k, palms, side, up), good, strict=True)
+        found = [replace(one, heat=before.heat) for one, before in again]
         return sorted((one for one in found if one.merit > least), key=lambda one: -one.merit)
 
     def start_search(
         self, depth_m: np.ndarray, k: np.ndarray, known: int = 0
     ) -> Callable[[], Places]:
-        """Where hands may be, the first part of a search; begun beside whatever can do without.
+        """The likeliest places of hands of either side, by the finder; begun in another thread if
+        there may be one; what is returned waits for it.
 
-        known: hands that are followed: the finder sees them, too, so that so many more places are
-            given.
+        known: how many hands are followed: the finder sees them, too, so that so many more places
+            are returned.
         """
-        cfg = self.settings
-        return start_finding(self.finder, depth_m, k, cfg.places + known, cfg.least)
+
+        @torch.inference_mode()
+        def look() -> tuple[Found, np.ndarray]:
+            image, wide_k = wide(depth_m, k)
+            return Found(*on_host(*self.finder(on_device(image, self.finder.device)))), wide_k
+
+        wait = beside(look) if isinstance(self.finder, OnnxFinder) else look
+        most, least = self.settings.places + known, self.settings.least
+        return lambda: likely_places(*wait(), most, least)
 
 
 def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,13 +15,10 @@ import cv2
 import numpy as np
 import torch
 
-from toftrack.compute.threads import beside, run_shared
-from toftrack.compute.transfer import on_device, on_host
-from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_at, crop_rotation, wide
+from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_at, crop_rotation
 from toftrack.detector.decoding_numba import KEPT, decode_at
 from toftrack.detector.detection import Detection, doubted_sigma_m
-from toftrack.detector.network import ANGLES, JOINTS, STRIDE, Finder, Found, PoseNet
-from toftrack.detector.onnx_networks import OnnxFinder, OnnxPoseNet
+from toftrack.detector.network import ANGLES, JOINTS, STRIDE, Found
 from toftrack.detector.parts import Parts, likeliest_parts
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.refinement.gauss_newton import Keypoints
@@ -46,27 +42,12 @@ class Places:
     probability: np.ndarray
 
 
-def start_finding(
-    finder: Finder | OnnxFinder, depth_m: np.ndarray, k: np.ndarray, most: int, least: float
-) -> Callable[[], Places]:
-    """Where hands of either side may be: at most `most` places, at least `least` likely.
-
-    depth_m: (H, W) rectified Z in metres, 0 = no reading.  k: (3, 3).
-    Begun in another thread if there may be one; what is returned waits for it.
-    """
-
-    @torch.inference_mode()
-    def look() -> tuple[Found, np.ndarray]:
-        image, wide_k = wide(depth_m, k)
-        return Found(*on_host(*finder(on_device(image, finder.device)))), wide_k
-
-    wait = beside(look) if isinstance(finder, OnnxFinder) else look
-    return lambda: _places(*wait(), most, least)
-
-
 @torch.inference_mode()
-def _places(found: Found, wide_k: np.ndarray, most: int, least: float) -> Places:
-    """See start_finding; wide_k: (3, 3) of the image that the finder has seen."""
+def likely_places(found: Found, wide_k: np.ndarray, most: int, least: float) -> Places:
+    """At most `most` places of hands, each at least `least` likely, by what the finder says.
+
+    wide_k: (3, 3) of the image that the finder has seen.
+    """
     # In numpy: on few numbers each of torch's operations takes longer than its arithmetic.
     heat = found.heat[0].sigmoid().numpy()
     peaks = (heat == cv2.dilate(heat, np.ones((3, 3), np.uint8))) & (heat >= least)
@@ -108,61 +89,7 @@ _OF_HYPOTHESES = {
 """Fields of a Detection that have a row for each hypothesis, as the compiled code writes them."""
 
 
-def run_pose_network(
-    pose: PoseNet | OnnxPoseNet,
-    depth_m: np.ndarray,
-    k: np.ndarray,
-    centres_m: np.ndarray,
-    side: str,
-    up: np.ndarray | None = None,
-) -> list[Detection]:
-    """What a hand of one side is like about each of C centres (C, 3), in their order.
-
-    up: (C, 3) where the fingers point, as far as that is known, which is up in the crops, see
-    crops.crop_rotation; None: crops as the camera is held. A network that learns hands that are
-    upright, more or less, knows them better.
-    """
-    count, found = len(centres_m), dict[int, Detection]()
-    rows = iter(range(count))
-
-    def look() -> None:
-        """At the next place as long as there is one, which other threads may have taken.
-
-        At each by itself: a batch takes as long, and what is said of a crop would depend on others.
-        """
-        for row in rows:
-            crop = _Crop(depth_m, k, centres_m[row], side, None if up is None else up[row])
-            found[row] = crop.decode(pose.outputs(crop.image))
-
-    run_shared(look, count if _may_be_shared(pose) else 1)
-    return [found[row] for row in range(count)]
-
-
-def start_pose_network(
-    pose: PoseNet | OnnxPoseNet,
-    depth_m: np.ndarray,
-    k: np.ndarray,
-    centre_m: np.ndarray,
-    side: str,
-    up: np.ndarray | None = None,
-) -> Callable[[], Detection]:
-    """The same at one place (3,), `up` (3,), begun in another thread if there may be one; what is
-    returned waits for it.
-
-    That thread has nothing to do but the network, so that it hardly needs the interpreter's lock.
-    """
-    crop = _Crop(depth_m, k, centre_m, side, up)
-    look = functools.partial(pose.outputs, crop.image)
-    wait = beside(look) if _may_be_shared(pose) else look
-    return lambda: crop.decode(wait())
-
-
-def _may_be_shared(pose: PoseNet | OnnxPoseNet) -> bool:
-    """Whether other threads may compute: torch has threads of its own, and needs the lock."""
-    return isinstance(pose, OnnxPoseNet) and decode_at.is_compiled
-
-
-class _Crop:
+class Crop:
     """What the pose network sees of a hand of one side at a place.
 
     image: (1, CROP_CHANNELS, CROP, CROP).

@@ -16,7 +16,7 @@ import numpy as np
 from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
-from toftrack.detector.detection import Detection, merit
+from toftrack.detector.detection import Detection
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.filter import PredictedHand, palm_of
 from toftrack.tracking.model import TrackerModel
@@ -64,7 +64,7 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
                 continue
             away = float(np.linalg.norm(one.detection.centre_m.numpy() - hand.palm_m)) / sigma
             if one.row == row or away < _GATE:
-                cost[row, column] = 0.5 * away**2 - merit(one.detection, one.detection.heat)
+                cost[row, column] = 0.5 * away**2 - one.detection.merit
     return cost
 
 

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from toftrack.compute.pace import Duration
-from toftrack.detector.detection import Detection, merit
+from toftrack.detector.detection import Detection
 from toftrack.detector.proposals import SAME_PLACE_M, Places
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.confidence import log_odds
@@ -169,7 +169,7 @@ def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]
     """
     arms = []
     for one in seen:
-        own = merit(one.detection, one.detection.heat)
+        own = one.detection.merit
         if own >= scene.model.detector.settings.merit:
             reliable = scene.hands[one.row].track.reliable
             arms.append((scene.arm(one.detection), math.inf if reliable else own))
