@@ -7,18 +7,12 @@ import torch.nn.functional as F
 
 from toftrack.detector.crops import CROP_M, crop_rotation
 from toftrack.detector.network import CELLS, PARTS, SEGMENTS
-from toftrack.detector.parts import ALL_HAND, BACKGROUND_PART, HAND_PART, Parts, likeliest_parts
+from toftrack.detector.parts import ALL_HAND, HAND_PART, UNKNOWN_PART, Parts, likeliest_parts
 
 CENTRE = np.array([0.1, -0.05, 0.5])
 TURN = crop_rotation(CENTRE, np.array([1.0, -0.4, 0.2]))
 DISTANCE = float(np.linalg.norm(CENTRE))
-
-
-def of_parts(depth_m: float) -> np.ndarray:
-    """(PARTS * PARTS, 3) seen points in the middles of all parts, row by row, camera frame."""
-    steps = (np.arange(PARTS) + 0.5) / PARTS - 0.5
-    across, down = (axis.ravel() * CROP_M / DISTANCE for axis in np.meshgrid(steps, steps))
-    return depth_m * np.stack((across, down, np.ones_like(across)), 1) @ TURN.T
+K = np.array([[150.0, 0, 60.0], [0, 160.0, 70.0], [0, 0, 1]])
 
 
 def test_the_likeliest_class_of_each_part_is_that_of_the_reference() -> None:
@@ -28,20 +22,27 @@ def test_the_likeliest_class_of_each_part_is_that_of_the_reference() -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_a_seen_point_has_the_class_of_the_part_in_which_it_is_seen(mirrored: bool) -> None:
-    kind = np.random.default_rng(0).integers(0, SEGMENTS, (PARTS, PARTS)).astype(np.uint8)
-    parts = Parts(kind, TURN, CENTRE, mirrored)
+def test_a_pixel_has_the_class_of_the_part_in_which_it_is_seen_if_any(mirrored: bool) -> None:
+    draw = np.random.default_rng(0)
+    kind = draw.integers(0, SEGMENTS, (PARTS, PARTS)).astype(np.uint8)
+    depth, asked = (
+        draw.uniform(0.3, 0.7, (120, 200)).astype(np.float32),
+        draw.random((120, 200)) < 0.9,
+    )
+    row, column = np.indices(depth.shape)
+    rays = np.stack(
+        ((column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones_like(depth)), 2
+    )
     flip = np.array([-1.0 if mirrored else 1.0, 1.0, 1.0])
-    for depth in (DISTANCE - 0.1, DISTANCE, DISTANCE + 0.1):
-        assert np.array_equal(parts.at(of_parts(depth) * flip), kind.ravel())
-
-
-def test_what_the_crop_does_not_show_is_background() -> None:
-    parts = Parts(np.full((PARTS, PARTS), HAND_PART, np.uint8), TURN, CENTRE, False)
-    behind, before = of_parts(DISTANCE + 0.16), of_parts(DISTANCE - 0.16)
-    beside = CENTRE + 0.16 * np.stack((TURN[:, 0], -TURN[:, 0], TURN[:, 1], -TURN[:, 1]))
-    for points in (behind, before, beside, np.zeros((1, 3)), -CENTRE[None]):
-        assert (parts.at(points) == BACKGROUND_PART).all()
+    across, down, away = np.moveaxis(depth[..., None] * rays * flip @ TURN, 2, 0)
+    scale = DISTANCE / CROP_M / away
+    place = np.floor(PARTS * (np.stack((down * scale, across * scale)) + 0.5)).astype(int)
+    shown = ((place >= 0) & (place < PARTS)).all(0) & (np.abs(away - DISTANCE) < CROP_M / 2) & asked
+    expected = np.full(depth.shape, UNKNOWN_PART)
+    expected[shown] = kind[place[0][shown], place[1][shown]]
+    assert 0.02 < shown.mean() < 0.9
+    found = Parts(kind, TURN, CENTRE, mirrored).seen(depth, asked, K)
+    assert np.array_equal(found, expected)
 
 
 def test_where_nothing_is_said_all_is_the_hand() -> None:

@@ -23,7 +23,6 @@ from toftrack.tracking.detect import (
     PendingDetections,
     finish_detection,
     held_out_first,
-    no_places,
     start_detection,
 )
 from toftrack.tracking.scene import Scene
@@ -167,7 +166,7 @@ def test_what_the_finder_saw_a_frame_ago_is_looked_at() -> None:
     _, _, asked = looked(known(), found=FOUND)
     places = asked.for_next_frame()
     again, seen, asked = looked(known(), found=FOUND, searched_s=FRAME_S, places=places)
-    assert not asked.asked and not len(asked.for_next_frame().centre_m)
+    assert not asked.finder_asked and not len(asked.for_next_frame().centre_m)
     assert elsewhere(seen) == [("left", 0.3)] and again.looked == ["left"], "the other hand"
 
 
@@ -270,8 +269,7 @@ def left_of(
     state = state_of(track, model=model, places=places_of(*others.values()))
     scene = scene_of(*state.tracks, image=replace(IMAGE, depth_m=depth), model=model)
     at_tracks = [] if seen is None else [lambda: SideDetection(seen, "right", 0)]
-    asked = PendingDetections(at_tracks, False, no_places, False)
-    found = finish_detection(asked, replace(scene, dt_s=dt_s), state)
+    found = finish_detection(PendingDetections(at_tracks), replace(scene, dt_s=dt_s), state)
     return {pose for pose, one in others.items() if any(one is each.detection for each in found)}
 
 

@@ -85,7 +85,7 @@ def test_an_image_that_is_larger_than_hands_are_segmented_in_is_cut_out_whole() 
     k[:2] *= 4
     k[:2, 2] += 1.5
     scene = scene_of(track_of(LEFT), image=DepthImage(depth, k, 0, 0.0))
-    assert scene.depth_m.size < depth.size
+    assert scene.reduced.depth_m.size < depth.size
     rest = scene.unexplained.depth_m
     assert rest.shape == depth.shape
     large = np.repeat(np.repeat(visible(LEFT), 4, 0), 4, 1)

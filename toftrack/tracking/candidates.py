@@ -17,7 +17,7 @@ from torch import Tensor
 
 from toftrack.detector.detection import Detection
 from toftrack.detector.hand_detector import DetectorSettings
-from toftrack.detector.parts import FOREARM_PART, THING_PART, Parts
+from toftrack.detector.parts import FOREARM_PART, THING_PART, UNKNOWN_PART, Parts
 from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.seen_points import SeenPoints, seen_points
@@ -42,9 +42,9 @@ _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
 far an angle may go."""
 _LEAST_PARTS = 4
 """A thing in the hand has at least so many cells of the crop's parts, of 9 mm each."""
-_MOSTLY, _UNKNOWN = 0.5, 255
+_MOSTLY = 0.5
 """A surface in front is the hand's arm when more than this share of it is, where the network sees
-it; and the class of what it does not see."""
+it."""
 _MARGIN = 0.05
 """What a pose of the detector loses in log posterior against the others: neighbouring fingers
 change places from frame to frame otherwise (swaps +0.6 points)."""
@@ -282,7 +282,7 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
     occluder = observation.occluder.numpy()
     count, surface = cv2.connectedComponents(occluder.astype(np.uint8), connectivity=4)
     kind = _classes(observation, observation.occluder, detection.parts)
-    known = np.bincount(surface[kind != _UNKNOWN], minlength=count)
+    known = np.bincount(surface[kind != UNKNOWN_PART], minlength=count)
     mine = np.bincount(surface[kind == FOREARM_PART], minlength=count)
     of_arm = (mine > _MOSTLY * known)[surface] & occluder
     if not of_arm.any():
@@ -292,6 +292,5 @@ def with_own_arm(observation: Observation, detection: Detection) -> Observation:
 
 
 def _classes(observation: Observation, pixels: Tensor, parts: Parts) -> np.ndarray:
-    """(H, W) what the pose network calls an image's pixels; _UNKNOWN where it does not look."""
-    depth_m, k = observation.depth_m.numpy(), observation.k.numpy()
-    return parts.seen(depth_m, pixels.numpy(), k, _UNKNOWN)
+    """(H, W) the classes of some `pixels` (H, W) of an observation, see Parts.seen."""
+    return parts.seen(observation.depth_m.numpy(), pixels.numpy(), observation.k.numpy())

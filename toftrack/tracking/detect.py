@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -38,22 +37,26 @@ class PendingDetections:
     """The networks at work on a frame.
 
     at_tracks: each waits for the detection at a predicted hand.
-    asked: whether the finder looks at this frame.  finder: waits for its places.
-    at_once: they are used in this frame, to find a hand anew; else in the next one.
+    places, later_places: wait for the finder's places, which are looked at in this frame, to find a
+        hand anew, or in the next one; None = the finder is not asked for such.
     """
 
     at_tracks: Sequence[Callable[[], SideDetection]]
-    asked: bool
-    finder: Callable[[], Places]
-    at_once: bool
+    places: Callable[[], Places] | None = None
+    later_places: Callable[[], Places] | None = None
+
+    @property
+    def finder_asked(self) -> bool:
+        """Whether the finder looks at this frame."""
+        return bool(self.places or self.later_places)
 
     def for_next_frame(self) -> Places:
         """The places that are left to look at in the next frame."""
-        return NO_PLACES if self.at_once else self.finder()
+        return self.later_places() if self.later_places else NO_PLACES
 
 
 def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
-    """The networks that are due in a frame, started: they work beside whatever comes next."""
+    """The networks that are due in a frame, which work beside whatever comes next."""
     detector = scene.model.detector
     several = len(state.slots) > 2 and scene.dt_s <= _RARE_S
     image = scene.unexplained if several else scene.image
@@ -61,28 +64,20 @@ def start_detection(scene: Scene, state: TrackerState) -> PendingDetections:
     urgent = not followed or scene.dt_s > _RARE_S
     frames = detector.settings.search * (1 if urgent else _FOLLOWED)
     due = frames == 1 or Duration(state.searched_s).reached(frames)
-    search = partial(detector.start_search, image.depth_m, image.k, len(scene.hands))
-    finder: Callable[[], Places] = no_places
-    if due and urgent:  # what is waited for first is begun first
-        finder = search()
-    at_tracks = [
-        _start(scene, row) for row in range(len(scene.hands)) if _is_asked(scene, row, state)
-    ]
-    if due and not urgent:
-        finder = search()
-    return PendingDetections(at_tracks, due, finder, due and urgent)
-
-
-def no_places() -> Places:
-    """The places of a finder that is not asked."""
-    return NO_PLACES
+    search = image.depth_m, image.k, len(scene.hands)
+    # What is waited for first is begun first.
+    places = detector.start_search(*search) if due and urgent else None
+    rows = range(len(scene.hands))
+    at_tracks = [_start(scene, row) for row in rows if _is_asked(scene, row, state)]
+    later_places = detector.start_search(*search) if due and not urgent else None
+    return PendingDetections(at_tracks, places, later_places)
 
 
 def finish_detection(
     pending: PendingDetections, scene: Scene, state: TrackerState
 ) -> list[SideDetection]:
     """All detections of a frame, those at tracks first."""
-    places = pending.finder() if pending.at_once else state.places
+    places = pending.places() if pending.places else state.places
     seen = [wait() for wait in pending.at_tracks]
     rare = scene.dt_s > _RARE_S
     believed = [] if rare else [hand.palm_m for hand in scene.hands if hand.track.reliable]

@@ -31,7 +31,7 @@ from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
 from toftrack.tracking.posterior import PosteriorWeights
-from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState
+from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState, changed
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)
 """What the particles do not know: the hand model's own error. Added to their covariance, it makes
@@ -116,10 +116,9 @@ class FilterModel:
         generator = torch.Generator().manual_seed(seed)
         return TrackerState(generator.get_state(), slots, told)
 
-    @cached_property
-    def at_quality(self) -> Callable[[Quality], FilterModel]:
+    def at_quality(self, quality: Quality) -> FilterModel:
         """The same tracker with less effort; itself where nothing is left out."""
-        return lambda _: self
+        return self
 
     @property
     def fits(self) -> bool:
@@ -196,25 +195,19 @@ class TrackerModel(FilterModel):
     posterior: PosteriorWeights
     lost: ConfidenceModel
 
-    @cached_property
-    def at_quality(self) -> Callable[[Quality], TrackerModel]:
-        """See FilterModel; each is made once."""
-        return lru_cache(partial(_at_quality, self))
-
-
-def _at_quality(model: TrackerModel, quality: Quality) -> TrackerModel:
-    if quality == Quality(quality.threads):
-        return model
-    settings, most = model.detector.settings, quality.places
-    settings = replace(
-        settings,
-        every=max(settings.every, quality.every),
-        search=max(settings.search, quality.search),
-        places=settings.places if most is None else min(settings.places, most),
-    )
-    made = replace(model, detector=replace(model.detector, settings=settings))
-    vars(made)["_hands"] = model._hands  # compiled parts that do not depend on the quality
-    return made
+    def at_quality(self, quality: Quality) -> TrackerModel:
+        """See FilterModel. What is cached is shared: only the detector's settings differ."""
+        if quality == Quality(quality.threads):
+            return self
+        settings, most = self.detector.settings, quality.places
+        settings = changed(
+            settings,
+            every=max(settings.every, quality.every),
+            search=max(settings.search, quality.search),
+            places=settings.places if most is None else min(settings.places, most),
+        )
+        detector = changed(self.detector, settings=settings)
+        return changed(self, detector=detector, _hands=self._hands)
 
 
 def _fitted_hand(

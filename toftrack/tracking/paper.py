@@ -29,9 +29,8 @@ from toftrack.tracking.confidence import Status
 from toftrack.tracking.filter import predict, run_filter, update_velocity
 from toftrack.tracking.model import FilterModel, FittedHand
 from toftrack.tracking.posterior import ImageTerm
-from toftrack.tracking.report import finish_estimate, make_estimate, report_absence
+from toftrack.tracking.report import StepResult, finish_estimate, make_estimate, report_absence
 from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState, changed
-from toftrack.tracking.step import StepResult
 
 _WIDEST_PALM_M, _HALF_PALM_M = 0.06, 0.012
 """Half the breadth of the broadest palm with the ball of the thumb, and half its thickness."""

@@ -65,10 +65,14 @@ class TrackResult:
     status: Status
 
 
+StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
+"""The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
+
+
 def report(
     state: TrackerState, results: Sequence[TrackResult], scene: Scene, spans: Spans
-) -> tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]:
-    """The state with its slots updated; per slot the info, None without a track; the estimates.
+) -> StepResult:
+    """The state with its slots updated, and what each slot reports.
 
     state: with the tracks that go on.  results: also of those that ended in this frame.
     """

@@ -53,44 +53,35 @@ class Scene:
         return cls(image, tuple(predict(track, dt_s, model) for track in tracks), dt_s, model)
 
     @cached_property
-    def _reduced(self) -> tuple[np.ndarray, np.ndarray]:
-        """Made when it is asked for: of a large image meanwhile the networks look."""
-        return reduce_image(self.image.depth_m, self.image.k, self.model.segmentation.max_pixels)
+    def reduced(self) -> DepthImage:
+        """The image reduced to the (h, w) pixels that hands are segmented in.
 
-    @property
-    def depth_m(self) -> np.ndarray:
-        """(H, W) m, the image reduced to the pixels that hands are segmented in."""
-        return self._reduced[0]
-
-    @property
-    def k(self) -> np.ndarray:
-        """(3, 3) of that."""
-        return self._reduced[1]
-
-    @cached_property
-    def _surfaces(self) -> np.ndarray:
-        """(B, H, W) m, Z of each predicted hand's surface, 0 = none."""
-        size = self.depth_m.shape
-
-        def drawn(hand: PredictedHand) -> np.ndarray:
-            return range_image(hand.fitted.refiner.surface(hand.pose), self.k, *size)
-
-        return np.array([drawn(hand) for hand in self.hands], np.float32).reshape(-1, *size)
+        It is made when first asked for: a large image is reduced while the networks look.
+        """
+        most = self.model.segmentation.max_pixels
+        depth_m, k = reduce_image(self.image.depth_m, self.image.k, most)
+        return replace(self.image, depth_m=depth_m, k=k)
 
     @cached_property
     def owners(self) -> np.ndarray:
-        """(H, W) int8, the row of the hand that owns each pixel; -1 = none does.
+        """(h, w) int8, the row of the hand that owns each pixel of `reduced`; -1 = none does.
 
         It is the hand whose surface is nearest to the pixel's depth, or whose outline the pixel
         mixes with what is behind. A track that is not reliable owns no pixels.
         """
-        owner = np.full(self.depth_m.shape, -1, np.int8)
+        depth_m, k = self.reduced.depth_m, self.reduced.k
+        size = depth_m.shape
+        drawn = [
+            range_image(hand.fitted.refiner.surface(hand.pose), k, *size) for hand in self.hands
+        ]
+        surfaces = np.array(drawn, np.float32).reshape(-1, *size)  # Z, 0 = none
         reliable = np.array([hand.track.reliable for hand in self.hands], np.bool_)
-        _own(self.depth_m, self._surfaces, reliable, np.empty_like(owner), owner)
+        owner = np.full(size, -1, np.int8)
+        _own(depth_m, surfaces, reliable, np.empty_like(owner), owner)
         return owner
 
     def owned_by_others(self, row: int) -> np.ndarray | None:
-        """(H, W) bool, the pixels that other hands own; None where no other one is reliable."""
+        """(h, w) bool, the pixels that other hands own; None where no other one is reliable."""
         others = (hand.track.reliable for at, hand in enumerate(self.hands) if at != row)
         return (self.owners >= 0) & (self.owners != row) if any(others) else None
 
@@ -105,7 +96,7 @@ class Scene:
         if others is None:
             return self.image
         nearest = float(self.hands[row].pose[0, 2]) - _IN_FRONT_M
-        return self._without(others & (self.depth_m > nearest))
+        return self._without(others & (self.reduced.depth_m > nearest))
 
     @cached_property
     def unexplained(self) -> DepthImage:
@@ -122,22 +113,18 @@ class Scene:
         the fingers.
         """
         wrist = detection.keypoints.points_m[0].numpy()
-        near = self._near(wrist, CROP_M / 2)
-        forearm = near[detection.parts.at(near) == FOREARM_PART]
+        depth_m, k, reach_m = self.reduced.depth_m, self.reduced.k, CROP_M / 2
+        kind = detection.parts.seen(depth_m, np.abs(depth_m - wrist[2]) < reach_m, k)
+        row, column = np.nonzero(kind == FOREARM_PART)
+        forearm = _points_at(row, column, depth_m, k)
+        forearm = forearm[np.abs(forearm - wrist).max(1) < reach_m]  # along each axis
         along = forearm.mean(0) - wrist if len(forearm) else -detection.up
         return wrist, along / max(float(np.linalg.norm(along)), 1e-6)
-
-    def _near(self, centre_m: np.ndarray, radius_m: float) -> np.ndarray:
-        """(P, 3) m, the image's points within radius_m along each axis of a point (3,)."""
-        row, column = np.nonzero(np.abs(self.depth_m - centre_m[2]) < radius_m)
-        points = _points_at(row, column, self.depth_m, self.k)
-        inside: np.ndarray = points[np.abs(points - centre_m).max(1) < radius_m]
-        return inside
 
     def segment(self, expected: Expected, row: int) -> Observation:
         """The observation of the hand of a row, -1 = of a new one, where it is expected."""
         others = self.owned_by_others(row)
-        return self.model.segmentation(self.depth_m, self.k, expected, others)
+        return self.model.segmentation(self.reduced.depth_m, self.reduced.k, expected, others)
 
     def others_joints(self, row: int) -> tuple[torch.Tensor, ...]:
         """The joints (21, 3) m of each reliable hand but the row's."""

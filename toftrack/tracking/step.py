@@ -11,7 +11,6 @@ import torch
 from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.compute.threads import small_operations
 from toftrack.detector.flying_pixels import without_flying_pixels
-from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
@@ -27,13 +26,10 @@ from toftrack.tracking.filter import (
     update_velocity,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.report import TrackResult, report
+from toftrack.tracking.report import StepResult, TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import ParticleSet, StepInfo, Track, TrackerState, changed
+from toftrack.tracking.state import ParticleSet, Track, TrackerState, changed
 from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
-
-StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
-"""The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
 
 
 @small_operations()
@@ -93,7 +89,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     state = changed(
         state,
         places=places,
-        searched_s=0.0 if pending.asked else state.searched_s,
+        searched_s=0.0 if pending.finder_asked else state.searched_s,
         next_track=state.next_track + len(begun),
         generator=generator.get_state(),
     )

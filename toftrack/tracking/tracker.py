@@ -23,8 +23,9 @@ from toftrack.render.closed_form import render_range_images
 from toftrack.render.scoring import Scorer
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
+from toftrack.tracking.report import StepResult
 from toftrack.tracking.state import OTHER_SIDE, Slot, StepInfo, Track, TrackerState
-from toftrack.tracking.step import StepResult, step
+from toftrack.tracking.step import step
 
 _RENDERED_PX = 72, 88
 """Size of an image that nobody sees."""
