@@ -18,7 +18,7 @@ from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.onnx_networks import DIGEST, OnnxFinder, OnnxPoseNet, digest, load_networks
-from toftrack.detector.weights import DEFAULT_FILE, save_weights
+from toftrack.detector.weights import DEFAULT_FILE, load_weights, save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training import onnx_export
 from toftrack.training.__main__ import main
@@ -61,10 +61,11 @@ def torch_runs(path: Path, caplog: pytest.LogCaptureFixture) -> str:
 def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weights: Path) -> None:
     pose, finder = load_networks(weights)
     assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
+    reference = load_weights(weights)
     draw = torch.Generator().manual_seed(0)
     for count in (1, 4):
         crops = torch.rand(count, CROP_CHANNELS, CROP, CROP, generator=draw)
-        expected = pose.reference.features(crops)
+        expected = reference.pose.features(crops)
         outputs = pose.outputs(crops.numpy())
         assert len(outputs) == 3
         for one, two in zip(outputs, expected, strict=False):
@@ -72,13 +73,14 @@ def test_a_file_of_weights_is_exported_and_answers_like_torch_at_any_size(weight
             assert 0 < away.square().mean().sqrt() < 0.1 * two.std()
     for size in ((1, 2, 16, 16), (2, 2, 80, 48)):
         images = torch.rand(size, generator=draw)
-        for one, two in zip(finder(images), finder.reference(images), strict=True):
+        for one, two in zip(finder(images), reference.finder(images), strict=True):
             assert 0 < (one - two).square().mean().sqrt() < 0.15 * two.std()
 
 
 def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand() -> None:
     pose, finder = load_networks()
     assert isinstance(pose, OnnxPoseNet) and isinstance(finder, OnnxFinder)
+    reference = load_weights()
     scene = sample().cut(30)
     centres = scene.joints_m[0, [0, 9]]
     for side in ("right", "left"):
@@ -86,19 +88,19 @@ def test_the_package_s_files_are_those_of_its_weights_and_say_the_same_of_a_hand
             HandDetector(network, finder, detector_settings()).detect(
                 scene.depth_m[0], scene.k, centres, side
             )
-            for network in (pose, pose.reference)
+            for network in (pose, reference.pose)
         ]
         found, expected = (torch.stack([one.keypoints.points_m for one in each]) for each in seen)
         away = (found - expected).norm(dim=-1).mean()
         assert float(away) < (0.003 if side == "right" else 0.010), "of the other side it guesses"
     image, _ = wide(scene.depth_m[0], scene.k)
     with torch.no_grad():
-        for one, two in zip(finder(image), finder.reference(image), strict=True):
+        for one, two in zip(finder(image), reference.finder(image), strict=True):
             assert float((one - two).square().mean().sqrt() / two.std()) < 0.15
 
 
 def test_the_files_are_in_8_bits_and_say_so_and_bad_ones_are_refused(exported: Path) -> None:
-    pose, finder = load_networks(exported)
+    reference = load_weights(exported)
     models = {name: onnx.load(onnx_networks.onnx_file(exported, name)) for name in NETWORKS}
     for name, ends in NETWORKS.items():
         model = models[name]
@@ -106,11 +108,11 @@ def test_the_files_are_in_8_bits_and_say_so_and_bad_ones_are_refused(exported: P
         kinds = [part.data_type for part in model.graph.initializer if len(part.dims) == 4]
         assert kinds.count(onnx.TensorProto.INT8) == len(kinds) - ends, "not the first and the last"
     crops, other = onnx_export.example_crops()[:4], small_networks()
-    onnx_export.compare(pose.reference, models["pose"], crops)
+    onnx_export.compare(reference.pose, models["pose"], crops)
     with pytest.raises(ToftrackError, match=r"mm away .* give --float"):
         onnx_export.compare(other[0], models["pose"], crops)
     images = torch.rand(4, 2, 32, 48, generator=torch.Generator().manual_seed(0)).numpy()
-    onnx_export.compare(finder.reference, models["finder"], images)
+    onnx_export.compare(reference.finder, models["finder"], images)
     with pytest.raises(ToftrackError, match=r"its spread away .* give --float"):
         onnx_export.compare(other[1], models["finder"], images)
 

@@ -15,6 +15,7 @@ from helpers.tracking import make_tracker, sample
 from toftrack.compute.pace import FRAME_S, Duration
 from toftrack.detector.detection import NO_DETECTION
 from toftrack.errors import ToftrackError
+from toftrack.frames.frame import DepthImage
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.association import track_ends
@@ -85,7 +86,7 @@ def features_of(
 ) -> ConfidenceFeatures:
     z, none = torch.from_numpy(depth), torch.zeros(depth.shape, dtype=torch.bool)
     seen = Observation(z, none, none, torch.from_numpy(K), 0.5)
-    return confidence_features(joints, score, 1.0, detection_of(palm_at()), NO_FEATURES, seen)
+    return confidence_features(joints, score, followed(), detection_of(palm_at()), seen)
 
 
 def test_features_are_of_order_one_and_finite() -> None:
@@ -111,7 +112,7 @@ def test_an_estimate_as_the_networks_see_it_has_good_features_and_more_confidenc
 def test_in_a_frame_without_a_detection_all_but_the_score_holds() -> None:
     last, none = features_of(PALM_M), torch.zeros(144, 176, dtype=torch.bool)
     seen = Observation(torch.from_numpy(WALL), none, none, torch.from_numpy(K), 0.5)
-    found = confidence_features(PALM_M + 1.0, 0.5, 1.0, NO_DETECTION, last, seen)
+    found = confidence_features(PALM_M + 1.0, 0.5, followed(features=last), NO_DETECTION, seen)
     assert found == replace(last, log_score=math.log(0.5))
 
 
@@ -261,7 +262,7 @@ def joint_features_of(
     keypoints = Keypoints(torch.from_numpy(joints_at()), torch.full((21,), 0.005))
     detection = replace(detection_of(torch.zeros(1, 27)), keypoints=keypoints)
     usual = {"detection": detection, "last": NO_JOINT_FEATURES, "score": 0.9, "log_odds": 2.0}
-    found = joint_features(joints, depth_m=depth, k=K, **(usual | changes))
+    found = joint_features(joints, image=DepthImage(depth, K, 0, 0.0), **(usual | changes))
     return dict(zip(JOINT_FEATURES, found.T, strict=True))
 
 

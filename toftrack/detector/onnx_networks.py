@@ -11,9 +11,8 @@ import functools
 import hashlib
 import logging
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Self, TypeVar, cast
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -34,51 +33,49 @@ FLOAT, WHOLE = "float32", "int8"
 COMMAND = "python -m toftrack.training export"
 _LARGEST_BYTES = 1 << 28
 _log = logging.getLogger(__name__)
-Network = TypeVar("Network", PoseNet, Finder)
 
 
 @dataclass(frozen=True, eq=False)
-class OnnxNetwork(Generic[Network]):
-    """A network for the CPU.  weights: the file of the one that it was made of."""
+class OnnxNetwork:
+    """A network for the CPU.
+
+    weights: the file of the network in torch that it was made of.  session: of ONNX Runtime.
+    """
 
     weights: Path
     session: Any
     device = torch.device("cpu")
     name: ClassVar[str]
 
-    @cached_property
-    def reference(self) -> Network:
-        """The network that it was made of, read when it is asked for: a GPU needs it."""
-        return cast(Network, getattr(load_weights(self.weights), self.name))
-
-    def to(self, device: torch.device) -> Network | Self:
-        """Itself on the CPU, elsewhere the reference."""
-        return self if device.type == "cpu" else self.reference.to(device)
+    def to(self, device: torch.device) -> Any:
+        """The same network on a device: itself on the CPU, else the one that it was made of."""
+        if device.type == "cpu":
+            return self
+        return getattr(load_weights(self.weights), self.name).to(device)
 
 
-class OnnxPoseNet(OnnxNetwork[PoseNet]):
+class OnnxPoseNet(OnnxNetwork):
     """A PoseNet for the CPU."""
 
     name = "pose"
 
     def outputs(self, crops: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Of crops (N, CROP_CHANNELS, 64, 64): what PoseNet.features returns; without the lock.
+        """What PoseNet.features returns, as arrays, for crops (N, CROP_CHANNELS, 64, 64); it does
+        not hold the interpreter's lock.
 
         Raises ToftrackError for a file of a network with other outputs.
         """
         outputs = self.session.run(("heads", "keypoints", "parts"), {"crops": crops})
-        heads, keypoints, parts = outputs
         n = len(crops)
         # Compiled code reads them, and believes their shapes.
-        shapes = (n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, 4 * SEGMENTS, CELLS, CELLS)
-        if any(one.dtype != np.float32 for one in outputs) or shapes != tuple(
-            one.shape for one in outputs
-        ):
+        shapes = [(n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, 4 * SEGMENTS, CELLS, CELLS)]
+        if [(one.dtype, one.shape) for one in outputs] != [(np.float32, one) for one in shapes]:
             raise ToftrackError("the detector's pose.onnx is of another network; " + _anew())
+        heads, keypoints, parts = outputs
         return heads, keypoints, parts
 
 
-class OnnxFinder(OnnxNetwork[Finder]):
+class OnnxFinder(OnnxNetwork):
     """A Finder for the CPU."""
 
     name = "finder"
@@ -92,7 +89,8 @@ class OnnxFinder(OnnxNetwork[Finder]):
 def load_networks(
     path: str | Path | None = None,
 ) -> tuple[PoseNet | OnnxPoseNet, Finder | OnnxFinder]:
-    """Both networks as they are used: by ONNX Runtime, or by torch, which is told.
+    """The pose network and the finder of a file of weights: run by ONNX Runtime, or, where it has
+    no files of these weights, by torch, of which a warning is logged.
 
     path: of the weights; None: those of the package.
     Raises ToftrackError when a file is damaged, or the weights are missing.
@@ -115,17 +113,17 @@ def load_networks(
 
 
 def onnx_file(weights: Path, network: str) -> Path:
-    """Where the file of a network, "pose" or "finder", is that is derived from weights."""
+    """The path of ONNX Runtime's file of a network, "pose" or "finder", made of weights."""
     return weights.with_suffix(f".{network}.onnx")
 
 
 def digest(content: bytes) -> bytes:
-    """What a file ends with, of all that stands before it."""
+    """The checksum with which a file ends, of the content before it."""
     return hashlib.sha256(content).hexdigest().encode()
 
 
 def read_session(file: Path, weights: Path) -> Any:
-    """An ONNX Runtime session of a file of some weights; None: there is no such file.
+    """An ONNX Runtime session of a file made of some weights; None: there is no such file.
 
     Raises ToftrackError for one that is damaged.
     """
@@ -146,7 +144,9 @@ def read_session(file: Path, weights: Path) -> Any:
 
 
 def open_session(content: bytes) -> Any:
-    """A session that computes in the thread that asks and nowhere else, also after a fork."""
+    """A session of a file's content, which computes in the caller's thread alone, also after a
+    fork.
+    """
     runtime = _runtime()
     options = runtime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -173,7 +173,7 @@ def _made_of(session: Any) -> tuple[str | None, ...]:
 
 @functools.cache
 def _warn(message: str) -> None:
-    """Once in a process."""
+    """Log a warning, each once in a process."""
     _log.warning(message)
 
 

@@ -24,6 +24,7 @@ from toftrack.compute.rigid_numba import distance
 from toftrack.detector.detection import Detection
 from toftrack.errors import ToftrackError, check_number
 from toftrack.files.json_text import read_json
+from toftrack.frames.frame import DepthImage
 from toftrack.render.segmentation import Observation
 
 if TYPE_CHECKING:
@@ -79,20 +80,14 @@ NO_FEATURES = ConfidenceFeatures(*[0.0] * len(FEATURES))
 
 
 def confidence_features(
-    joints_m: Tensor,
-    score: float,
-    age_s: float,
-    detection: Detection,
-    last: ConfidenceFeatures,
-    observation: Observation,
+    joints_m: Tensor, score: float, track: Track, detection: Detection, observation: Observation
 ) -> ConfidenceFeatures:
-    """The features of an estimate with joints (21, 3) in an image.
+    """The features of a track's estimate with joints (21, 3) in an image.
 
-    age_s: seconds since its track began.
-    last: of the frame before; in a frame without a detection, all but the score hold.
+    track: as of the frame before; without a detection, all of its features but the score hold.
     """
     if detection.empty:
-        return replace(last, log_score=math.log(max(score, _LEAST)))
+        return replace(track.features, log_score=math.log(max(score, _LEAST)))
     keypoints, k = detection.keypoints, observation.k.double().numpy()
     off = np.empty(len(detection.joints_m))
     known_m, sigma_m = keypoints.points_m.numpy(), keypoints.sigma_m.numpy()
@@ -113,7 +108,7 @@ def confidence_features(
         other_side=_surprise(detection.right_side),
         unseen=unseen,
         hidden=hidden,
-        young=1 / (1 + age_s / FRAME_S),
+        young=1 / (1 + track.age.seconds / FRAME_S),
     )
 
 
@@ -277,15 +272,12 @@ def joint_features(
     last: np.ndarray,
     score: float,
     log_odds: float,
-    depth_m: np.ndarray,
-    k: np.ndarray,
+    image: DepthImage,
 ) -> np.ndarray:
-    """(21, J) features of the joints, in the order of JOINT_FEATURES.
+    """(21, J) features of the joints (21, 3), in the order of JOINT_FEATURES.
 
-    joints_m: (21, 3).
     last: (21, J) of the frame before; in a frame without a detection, those of its keypoints hold.
     score: of the image, 0..1.  log_odds: that the estimate is right.
-    depth_m: (H, W), 0 = no reading.  k: (3, 3).
     """
     features = np.empty((len(joints_m), len(JOINT_FEATURES)))
     if detection.empty:
@@ -293,7 +285,7 @@ def joint_features(
     else:
         keypoints = detection.keypoints
         compare_keypoints(joints_m, keypoints.points_m.numpy(), keypoints.sigma_m.numpy(), features)
-    look_around(joints_m, depth_m, k.astype(np.float64), _BELOW_M, features)
+    look_around(joints_m, image.depth_m, image.k.astype(np.float64), _BELOW_M, features)
     features[:, 7] = -math.log(max(score, _LEAST))
     features[:, 9] = np.logaddexp(0.0, -log_odds)
     return features

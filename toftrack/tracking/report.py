@@ -79,20 +79,17 @@ def report(
     rights = [side_log_odds(one.track, state.tracks, state.told) for one in results]
     # Tracks that this frame shows nothing of keep their slots, as they go on.
     unseen = {track.number for track in state.tracks} - {one.track.number for one in results}
-    slots, infos, estimates = [], list[StepInfo | None](), []
+    reports = list[tuple[Slot, StepInfo | None, Estimate]]()
     for number, row in enumerate(assign_slots(state, results, rights)):
-        slot, info = state.slots[number], None
         if row is None:
-            if slot.track not in unseen:
-                slot = changed(slot, track=-1)
+            slot = state.slots[number]
+            slot = slot if slot.track in unseen else changed(slot, track=-1)
             slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
+            reports.append((slot, None, estimate))
         else:
-            each = results[row], rights[row]
-            slot, info, estimate = report_track(number, *each, state, scene, spans)
-        slots.append(slot)
-        infos.append(info)
-        estimates.append(estimate)
-    return changed(state, slots=tuple(slots)), tuple(infos), tuple(estimates)
+            reports.append(report_track(number, results[row], rights[row], state, scene, spans))
+    slots, infos, estimates = zip(*reports, strict=True)
+    return changed(state, slots=slots), infos, estimates
 
 
 def assign_slots(
@@ -134,12 +131,7 @@ def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerSt
 
 
 def report_track(
-    number: int,
-    one: TrackResult,
-    right: float,
-    state: TrackerState,
-    scene: Scene,
-    spans: Spans,
+    number: int, one: TrackResult, right: float, state: TrackerState, scene: Scene, spans: Spans
 ) -> tuple[Slot, StepInfo, Estimate]:
     """Slot `number` with a track's result, the info, and the estimate.
 
@@ -152,8 +144,9 @@ def report_track(
     estimate = make_estimate(
         image, one.filtered, track.pose, one.score, one.status, view.fitted, model
     )
-    seen = view.detection, slot.joint_features, one.score, track.log_odds
-    rows = joint_features(estimate.joints_m, *seen, image.depth_m, image.k)
+    rows = joint_features(
+        estimate.joints_m, view.detection, slot.joint_features, one.score, track.log_odds, image
+    )
     sigma, confidence = model.lost.joints.judge(rows)
     estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
     if estimate.confidence < model.lost.confidence and not estimate.lost:  # by its side

@@ -160,9 +160,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
         pose, trend = steadied(pose, track.pose, track.trend, dt_s, motions)
         track = changed(track, trend=trend)
     score, joints_m = view.image.score(pose), view.fitted.refiner.joints(pose)[0]
-    features = confidence_features(
-        joints_m, score, track.age.seconds, view.detection, track.features, view.observation
-    )
+    features = confidence_features(joints_m, score, track, view.detection, view.observation)
     status = judge(track, features, dt_s, model.lost)
     # Without refinement the particles stay where they are.
     drawn = shift_particles(filtered, pose, model) if refines else filtered
