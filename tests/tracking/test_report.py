@@ -1,6 +1,5 @@
 """Which hand is reported in which slot, and what is said of it."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,51 +63,74 @@ def numbers(state: TrackerState, *tracks: Track) -> list[int]:
     return [slot.track for slot in reported(state, *tracks)[0].slots]
 
 
-@pytest.mark.parametrize(
-    ("told", "sides", "expected"),
-    [
-        ("right", ["left", "right"], 1),
-        ("left", ["left", "right"], 0),
-        ("right", ["perhaps left", "perhaps right"], 1),
-        (None, ["left", "right"], 0),
-        (None, ["right", "left"], 0),
-    ],
-    ids=["right", "left", "the likelier", "whichever was first", "whichever was first, too"],
-)
-def test_of_two_hands_the_one_that_was_asked_for_is_reported(
-    told: str | None, sides: Sequence[str], expected: int
+RIGHT, LEFT = hand(0, "right"), hand(1, "left")
+POINTING, PALM = hand(0, log_odds=0.5), hand(1, "left", log_odds=2.5)
+HERE = {"track": 1, "known": "right"}
+"""Of the first slot: the second track was there before."""
+CASES = {
+    "of two hands the right one": (before(told="right"), [hand(0, "left"), hand(1)], [1]),
+    "of two hands the left one": (before(told="left"), [hand(0, "left"), hand(1)], [0]),
+    "the one that is likelier of the told side": (
+        before(told="right"),
+        [hand(0, "perhaps left"), hand(1, "perhaps right")],
+        [1],
+    ),
+    "whichever was first": (before(), [hand(0, "left"), hand(1)], [0]),
+    "whichever was first, too": (before(), [RIGHT, LEFT], [0]),
+    "a believed one before a lost one": (before(), [hand(0, lost=True), hand(1)], [1]),
+    "a lost one before one that was never believed": (
+        before(),
+        [hand(0, confirmed=False), hand(1, lost=True)],
+        [1],
+    ),
+    # The one that is held out comes first, see detect.held_out_first.
+    "the first one though another is seen better": (before(), [POINTING, PALM], [0]),
+    "but not if it is probably wrong": (before(), [hand(0, log_odds=-0.5), PALM], [1]),
+    "nor if the other one comes back": (before(known="left"), [POINTING, PALM], [1]),
+    "one keeps the only slot": (before(1, **HERE), [hand(0), hand(1)], [1]),
+    "one keeps the first of two slots": (before(2, **HERE), [hand(0), hand(1)], [1, 0]),
+    "one keeps the first of four slots": (before(4, **HERE), [hand(0), hand(1)], [1, 0, -1, -1]),
+    "one keeps the only slot while it is lost": (
+        before(1, **HERE),
+        [hand(0), hand(1, lost=True, log_odds=1.2)],
+        [1],
+    ),
+    "one keeps the first of two slots while it is lost": (
+        before(2, **HERE),
+        [hand(0), hand(1, lost=True, log_odds=1.2)],
+        [1, 0],
+    ),
+    # As when an elbow was taken for the hand while something hid it.
+    "one that is much surer takes the only slot": (
+        before(**HERE),
+        [hand(0, log_odds=2.5), hand(1, log_odds=0.0)],
+        [0],
+    ),
+    "one that is a little surer does not": (
+        before(**HERE),
+        [hand(0, log_odds=2.5), hand(1, log_odds=1.5)],
+        [1],
+    ),
+    "of the other side than told into the second slot": (
+        before(2, "right"),
+        [hand(0, "left")],
+        [-1, 0],
+    ),
+    "of the told side into the first": (before(2, "left"), [hand(0, "left")], [0, -1]),
+    "of more hands than slots the first ones": (before(2), [RIGHT, LEFT, hand(2)], [0, 1]),
+    # Where no side was said, a hand that comes may be the first one again.
+    "one of the same side": (before(known="right", away_s=0.5), [hand(1)], [1]),
+    "none of the other side": (before(known="right", away_s=0.5), [LEFT], [-1]),
+    "one of the other side long after": (before(known="right", away_s=3.0), [LEFT], [1]),
+}
+
+
+@pytest.mark.parametrize(("state", "tracks", "expected"), CASES.values(), ids=CASES)
+def test_tracks_come_into_slots(
+    state: TrackerState, tracks: list[Track], expected: list[int]
 ) -> None:
-    tracks = [hand(at, side) for at, side in enumerate(sides)]
-    assert numbers(before(told=told), *tracks) == [expected]
-    assert numbers(before(told=told), *tracks[::-1]) == [expected], "in whichever row"
-
-
-def test_a_hand_that_is_believed_comes_before_one_that_is_not() -> None:
-    assert numbers(before(), hand(0, lost=True), hand(1)) == [1]
-    assert numbers(before(), hand(0, confirmed=False), hand(1, lost=True)) == [1]
-
-
-def test_where_no_side_was_said_the_first_hand_is_reported_though_another_is_seen_better() -> None:
-    """The one that is held out comes first, see detect.held_out_first."""
-    pointing, palm = hand(0, log_odds=0.5), hand(1, "left", log_odds=2.5)
-    assert numbers(before(), pointing, palm) == numbers(before(), palm, pointing) == [0]
-    assert numbers(before(), hand(0, log_odds=-0.5), palm) == [1], "it is probably wrong"
-    assert numbers(before(known="left"), hand(0, log_odds=0.5), palm) == [1], "it comes back"
-
-
-@pytest.mark.parametrize("hands", [1, 2, 4])
-def test_a_hand_keeps_its_slot(hands: int) -> None:
-    state = before(hands, track=1, known="right")
-    assert numbers(state, hand(0), hand(1))[0] == 1
-    while_lost = numbers(state, hand(0), hand(1, lost=True, log_odds=1.2))
-    assert while_lost[:2] == [1, 0][:hands]
-
-
-def test_the_only_slot_goes_to_a_hand_that_is_much_surer() -> None:
-    """As when an elbow was taken for the hand while something hid it."""
-    state = before(track=1, known="right")
-    assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=0.0)) == [0]
-    assert numbers(state, hand(0, log_odds=2.5), hand(1, log_odds=1.5)) == [1]
+    assert numbers(state, *tracks) == expected
+    assert numbers(state, *tracks[::-1]) == expected, "in whichever row"
 
 
 @pytest.mark.parametrize("told", ["right", "left"])
@@ -119,11 +141,6 @@ def test_of_two_slots_the_first_is_of_the_told_side(told: str, first: str) -> No
     assert [slot.track for slot in state.slots] == ([0, 1] if first == told else [1, 0])
     assert [one.side for one in estimates] == [told, "left" if told == "right" else "right"]
     assert not any(one.lost for one in estimates)
-
-
-def test_where_a_side_was_said_a_hand_of_the_other_side_comes_into_the_second_slot() -> None:
-    assert numbers(before(2, "right"), hand(0, "left")) == [-1, 0]
-    assert numbers(before(2, "left"), hand(0, "left")) == [0, -1]
 
 
 def test_where_no_side_was_said_two_hands_come_in_their_order_and_back_into_their_slots() -> None:
@@ -156,22 +173,6 @@ def test_a_hand_of_which_a_frame_shows_nothing_keeps_its_slot(hands: int) -> Non
     assert [slot.track for slot in blank.slots] == [slot.track for slot in state.slots]
     gone, *_ = report(replace(state, tracks=()), [], scene, Spans())
     assert {slot.track for slot in gone.slots} == {-1}
-
-
-def test_of_more_hands_than_slots_the_first_ones_are_reported() -> None:
-    assert numbers(before(2), hand(0), hand(1, "left"), hand(2)) == [0, 1]
-
-
-@pytest.mark.parametrize(
-    ("side", "away_s", "taken"),
-    [("right", 0.5, True), ("left", 0.5, False), ("left", 3.0, True)],
-    ids=["of the same side", "of the other", "long after"],
-)
-def test_where_no_side_was_said_a_hand_that_comes_may_be_the_first_one_again(
-    side: str, away_s: float, taken: bool
-) -> None:
-    state = before(known="right", away_s=away_s)
-    assert numbers(state, hand(1, side)) == [1 if taken else -1]
 
 
 def test_what_is_taken_for_a_hand_meanwhile_does_not_change_which_one_may_come_back() -> None:
