@@ -33,7 +33,7 @@ WIDE_RANGE_M = 1.6
 def crop_rotation(centre_m: np.ndarray, up: np.ndarray | None = None) -> np.ndarray:
     """(3, 3) from the crop's frame, whose z axis points at the centre (3,), to the camera's.
 
-    up: (3,) what is up in the crop (-y), as far as it lies across; None: as the camera has it.
+    up: (3,) direction whose part across the z axis is up (-y) in the crop; None: the camera's up.
     """
     upright = _shortest_rotation(centre_m)
     if up is None:
@@ -122,7 +122,8 @@ def crop_at(depth, mirror, k, centre, turn, image):
 
 @compiled
 def _place(shape, flip, mapping, slope, line, places, share):
-    """Of a line's samples: the flat places of their pixels, -1 for none, and z over Z.
+    """Write for a line's samples the flat index of their pixel, -1 = none, into `places`, and their
+    depth z along the crop's axis over their Z into `share`.
 
     mapping: (3, 3) float32 from the crop's samples to pixels.
     slope: (3,) float32, of a sample: its Z over its z along the crop's axis.

@@ -100,6 +100,7 @@ def _decode_hypotheses(reported, turn, centre, mirror, hand, out):
 
 @compiled
 def _largest(values):
+    """The index of the largest value."""
     found = 0
     for i in range(len(values)):
         if values[i] > values[found]:
@@ -109,7 +110,9 @@ def _largest(values):
 
 @compiled
 def _rotation(reported, anchor, turn, matrix):
-    """turn G anchor, of the first two columns that are told G being made a rotation."""
+    """Write turn @ G @ anchor into `matrix`, where G is the rotation that Gram-Schmidt makes of the
+    two columns `reported`.
+    """
     x = (1 + 0.5 * reported[0], 0.5 * reported[1], 0.5 * reported[2])
     y = (0.5 * reported[3], 1 + 0.5 * reported[4], 0.5 * reported[5])
     norm = math.sqrt(x[0] * x[0] + x[1] * x[1] + x[2] * x[2])

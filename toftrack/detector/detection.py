@@ -17,9 +17,9 @@ from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M
 from toftrack.refinement.gauss_newton import Keypoints
 
 _DOUBT_M = 0.06
-"""How far off a finger's outer joints may be that lies in another one, by the keypoints."""
+"""Standard deviation that is added to a finger's outer joints where it lies wholly in another."""
 _OUTER = np.array([0, 1, 1, 1], np.float32)
-"""Of a finger's joints, those that may be another one's."""
+"""Which of a finger's four joints are outer ones, which may belong to another finger."""
 _CLEAR_M = 0.010
 """Expected error that counts as much as a factor e in probability."""
 
@@ -60,9 +60,10 @@ class Detection:
         return odds - doubt_m / _CLEAR_M
 
     def states(self, ratio: float, count: int | None = None) -> Tensor:
-        """(H, 27) as states of a hand whose length is `ratio` mean adult's: same palm's middle.
+        """(H, 27) the hypotheses as poses of a hand of `ratio` times the mean adult's length, with
+        the middle of the palm where it is.
 
-        count: of so many hypotheses at most; None = all.
+        count: how many hypotheses at most; None = all.
         """
         pivot, rotvec = self.pivot_m.numpy()[:count], self.rotvec.numpy()[:count]
         states = np.empty((len(rotvec), 27), np.float32)
@@ -88,7 +89,7 @@ class Detection:
 
     @property
     def up(self) -> np.ndarray:
-        """(3,) where its fingers point: from the wrist to the middle finger's knuckle."""
+        """(3,) m from the wrist to the middle finger's knuckle: where the fingers point."""
         wrist, knuckle = self.keypoints.points_m[[0, 9]].numpy()
         return np.asarray(knuckle - wrist)
 

@@ -21,7 +21,8 @@ from toftrack.detector.proposals import Crop, Places, likely_places
 from toftrack.errors import check_number
 
 _AGAIN = 3.0
-"""The first look may be so much worse than what a hand needs: the second one is more exact."""
+"""A place is looked at again if its merit is less than what a hand needs by no more than this: the
+second look is more exact."""
 
 
 @dataclass(frozen=True)

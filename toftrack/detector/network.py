@@ -23,9 +23,9 @@ from toftrack.detector.crops import CROP_CHANNELS, CROP_M
 from toftrack.hand.skeleton import ANGLE_LIMITS
 
 SEGMENTS = 5
-"""Background, the hand, its forearm, another hand or forearm, things."""
+"""Classes of pixels: background, the hand, its forearm, another hand or forearm, things."""
 PARTS = 32
-"""Side of the picture of parts that the pose network also learns."""
+"""Side of the map of classes that the pose network also predicts for a crop."""
 STRIDE = 4
 """Pixels of the finder's image to a cell of its map."""
 ANGLES = 21

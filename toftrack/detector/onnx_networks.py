@@ -32,6 +32,8 @@ FLOAT, WHOLE = "float32", "int8"
 """Precisions that such a file says it is in."""
 COMMAND = "python -m toftrack.training export"
 _LARGEST_BYTES = 1 << 28
+_MADE_OF = ("format", "version", "network", "weights_sha256")
+"""Properties of such a file that say which network it is, and of which weights."""
 _log = logging.getLogger(__name__)
 
 
@@ -101,12 +103,13 @@ def load_networks(
     for network in ("pose", "finder"):
         file = onnx_file(weights, network)
         session = read_session(file, weights)
-        known = session is not None
-        if not known or _made_of(session) != (FORMAT, VERSION, network, sha256):
-            why = f"{file} is of other weights" if known else f"there is no {file}"
-            _warn(f"{why}: torch runs the detector's networks, slower; {_make(weights)}")
-            loaded = load_weights(weights)
-            return loaded.pose, loaded.finder
+        made_of = session and session.get_modelmeta().custom_metadata_map
+        known = made_of and tuple(map(made_of.get, _MADE_OF))
+        if known != (FORMAT, VERSION, network, sha256):
+            why = f"{file} is of other weights" if session else f"there is no {file}"
+            remedy = f"make it with {COMMAND} {weights}"
+            _warn(f"{why}: torch runs the detector's networks, slower; {remedy}")
+            return load_weights(weights)[:2]
         sessions.append(session)
     pose, finder = sessions
     return OnnxPoseNet(weights, pose), OnnxFinder(weights, finder)
@@ -165,20 +168,10 @@ def _runtime() -> Any:
     return onnxruntime
 
 
-def _made_of(session: Any) -> tuple[str | None, ...]:
-    """Format, version and name of a file's network, and the checksum of its weights."""
-    properties = session.get_modelmeta().custom_metadata_map
-    return tuple(map(properties.get, ("format", "version", "network", "weights_sha256")))
-
-
 @functools.cache
 def _warn(message: str) -> None:
     """Log a warning, each once in a process."""
     _log.warning(message)
-
-
-def _make(weights: Path) -> str:
-    return f"make it with {COMMAND} {weights}"
 
 
 def _anew(weights: Path | None = None) -> str:

@@ -1,7 +1,7 @@
-"""From depth images to hypotheses: where hands may be, and what poses they may have there.
+"""What the networks' outputs say: places of hands by the finder, detections by the pose network.
 
-The networks know right hands. For a left one the image is read as a mirror shows it, and what was
-found is mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they are.
+The pose network knows right hands. For a left one the image is read as a mirror shows it, and what
+was found is mirrored after: t_x -> -t_x, R -> M R M with M = diag(-1, 1, 1), angles as they are.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def likely_places(found: Found, wide_k: np.ndarray, most: int, least: float) -> 
 
 
 def _apart(centres_m: np.ndarray, most: int) -> list[int]:
-    """Rows of the first of all places that are the same, in their order, `most` at most."""
+    """Indices of places, likeliest first, `most` at most: of those on one palm only the first."""
     kept: list[int] = []
     for row, centre in enumerate(centres_m):
         if len(kept) == most:
@@ -90,7 +90,7 @@ _OF_HYPOTHESES = {
 
 
 class Crop:
-    """What the pose network sees of a hand of one side at a place.
+    """The crop that the pose network sees at a place, where a hand of one side is looked for.
 
     image: (1, CROP_CHANNELS, CROP, CROP).
     """
@@ -115,7 +115,7 @@ class Crop:
         crop_at(np.ascontiguousarray(depth_m, np.float32), left, k, centre, turn, self.image[0])
 
     def decode(self, outputs: tuple[np.ndarray, ...]) -> Detection:
-        """What the network's outputs for the crop mean, in the camera frame."""
+        """The detection, in the camera frame, that the network's outputs for the crop mean."""
         heads, keypoints, painted = outputs
         found = {name: np.empty(shape, np.float32) for name, shape in _OF_HYPOTHESES.items()}
         points, sigma, odds = (np.empty(shape, np.float32) for shape in ((JOINTS, 3), JOINTS, 2))

@@ -24,14 +24,15 @@ from toftrack.tracking.posterior import touching
 from toftrack.tracking.state import Track, TrackerState, changed
 
 _STEP_M, _SPEED_M_S = 0.04, 0.25
-"""Standard deviation of a predicted palm, and its growth from the last believed frame on."""
+"""Standard deviation of a predicted palm's place, and how fast it grows from the last believed
+frame on."""
 _GATE = 3.5
-"""Standard deviations from which on a detection at the finder's place is not of a track."""
+"""A detection at a place of the finder is not of a track that is more standard deviations away."""
 _SAME_PALM_M, _SAME_HAND_M, _SAME_JOINTS = 0.022, 0.045, 0.3
 """Two hands are the same where their palms' middles are nearer than a palm is thick; or less near,
 and more than this share of one lies in the other, see posterior.touching."""
 _WITHOUT = 5e5
-"""Cost of a track without detection; that of an impossible pair is twice as much."""
+"""Cost of a track that gets no detection; an impossible pair costs twice as much."""
 _TENTATIVE_S = 0.5
 """A tentative track beside a confirmed one ends at this age."""
 
@@ -71,7 +72,9 @@ def costs(hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: f
 def associate(
     hands: Sequence[PredictedHand], seen: Sequence[SideDetection], dt_s: float
 ) -> tuple[list[SideDetection | None], list[SideDetection]]:
-    """The detection of each track's hand, None where it has none; and those that may begin one."""
+    """The detection of each track's hand, None where it has none; and the detections that may begin
+    a track.
+    """
     columns = assign(costs(hands, seen, dt_s))
     return [seen[at] if at >= 0 else None for at in columns], unassigned(seen, columns)
 
@@ -139,7 +142,10 @@ def _assign_rows(cost, found):
 
 
 def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[SideDetection]:
-    """The finder's detections that are of no track's hand, each hand once.  taken: see assign."""
+    """The detections at the finder's places that are of no track's hand, one for each hand.
+
+    taken: the index of the detection of each track, -1 = none, see assign.
+    """
     explained = [seen[column] for column in taken if column >= 0]
     new = [one for column, one in enumerate(seen) if one.row < 0 and column not in taken]
     found: list[SideDetection] = []
@@ -150,7 +156,7 @@ def unassigned(seen: Sequence[SideDetection], taken: Sequence[int]) -> list[Side
 
 
 def _same(first: SideDetection, second: SideDetection) -> bool:
-    """Whether two detections are of the same hand, as all of one side at one place are."""
+    """Whether two detections are of the same hand; those of one side at one place always are."""
     palms = [one.detection.centre_m.numpy() for one in (first, second)]
     apart = float(np.linalg.norm(palms[0] - palms[1]))
     if first.side == second.side and apart < SAME_PLACE_M:
@@ -159,21 +165,23 @@ def _same(first: SideDetection, second: SideDetection) -> bool:
 
 
 def same_hand(apart_m: float, first: Tensor, second: Tensor) -> bool:
-    """Whether joints (21, 3) are of the same hand, whose palms are so far apart."""
+    """Whether two sets of joints (21, 3), whose palms are apart_m apart, are of the same hand."""
     if apart_m > _SAME_HAND_M:
         return False
     return apart_m < _SAME_PALM_M or float(touching(first[None], second)) > _SAME_JOINTS
 
 
 def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
-    """Whether a track ends: doubtful for `patience` frames (0 = never), or tentative too long."""
+    """Whether a track ends: because it was doubtful for `patience` frames (0 = never), or tentative
+    for too long beside a confirmed one.
+    """
     if patience and track.doubtful.begun and track.doubtful.reached(patience):
         return True
     return not track.confirmed and confirmed_beside and track.age.seconds > _TENTATIVE_S
 
 
 def keep_tracks(state: TrackerState, tracks: Sequence[Track], model: TrackerModel) -> TrackerState:
-    """The state with the tracks that go on, one a hand."""
+    """The state with those of the tracks that go on; of tracks on one hand, the surest."""
     confirmed = sum(track.confirmed for track in tracks)
     ended = {
         track.number

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from toftrack.detector.detection import Detection
-from toftrack.detector.hand_detector import DetectorSettings
 from toftrack.detector.parts import FOREARM_PART, THING_PART, UNKNOWN_PART, Parts
 from toftrack.hand.overlap import finger_overlap
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
@@ -38,23 +37,25 @@ _HIDDEN = 0.03
 _UNLIKELY = 0.03
 """Hypotheses that are less probable are no candidates."""
 _BENT_STEPS, _BENT_M, _BENT_RAD = 6, 0.010, 0.8
-"""In how many steps a pose is bent to the keypoints; how sure the keypoints are at best, and how
-far an angle may go."""
+"""Where a pose is bent to the keypoints: Gauss-Newton steps; the least standard deviation of a
+keypoint; and the standard deviation of an angle about the pose."""
 _LEAST_PARTS = 4
-"""A thing in the hand has at least so many cells of the crop's parts, of 9 mm each."""
+"""A thing in the hand covers at least so many of the crop's parts, which are 9 mm wide."""
 _MOSTLY = 0.5
 """A surface in front is the hand's arm when more than this share of it is, where the network sees
 it."""
 _MARGIN = 0.05
-"""What a pose of the detector loses in log posterior against the others: neighbouring fingers
-change places from frame to frame otherwise (swaps +0.6 points)."""
+"""By how much the log posterior of a pose of the detector must exceed that of the other poses:
+neighbouring fingers change places from frame to frame otherwise (swaps +0.6 points)."""
 _SURE_LEAD = 2.0
-"""The same of a pose elsewhere while something hides the hand: without it, a second hand that
+"""The same where the pose is elsewhere and something hides the hand: without it, a second hand that
 crosses the first one is silently wrong in 5 % of the frames."""
 _ELSEWHERE_M = 0.02
-"""A pose of the detector is elsewhere when its joints are so far from the others', on average."""
+"""A pose of the detector is elsewhere when its joints are on average so far from those of the best
+other pose."""
 WORST = -1e6
-"""Instead of the -inf of a pose that explains nothing, so that differences stay numbers."""
+"""Log posterior that replaces the -inf of a pose that explains nothing, so that differences of log
+posteriors are finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,8 +104,12 @@ class View:
     @cached_property
     def keypoints(self) -> Keypoints:
         """The detection's keypoints, with the configured least deviation."""
-        cfg = self.model.detector.settings
-        return keypoints_of(self.detection, cfg, cfg.keypoint_m)
+        return self.keypoints_within(self.model.detector.settings.keypoint_m)
+
+    def keypoints_within(self, least_m: float) -> Keypoints:
+        """The detection's keypoints, with the configured weight and a least deviation."""
+        found, weight = self.detection.keypoints, self.model.detector.settings.keypoint_weight
+        return Keypoints(found.points_m, found.sigma_m.clamp(min=least_m) / max(weight, 1e-6))
 
     @cached_property
     def seen(self) -> SeenPoints:
@@ -147,13 +152,6 @@ def with_parts(view: View) -> View:
     return view if seen is view.observation else replace(view, observation=seen)
 
 
-def keypoints_of(detection: Detection, settings: DetectorSettings, least_m: float) -> Keypoints:
-    """A detection's keypoints, with the configured weight and a least deviation."""
-    found = detection.keypoints
-    sigma = found.sigma_m.clamp(min=least_m)
-    return Keypoints(found.points_m, sigma / max(settings.keypoint_weight, 1e-6))
-
-
 def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tensor:
     """(H, 27) the likely hypotheses, `count` at most, as poses of a hand; the best one at least."""
     likely = int((detection.log_probability.numpy() > math.log(_UNLIKELY)).sum())
@@ -161,7 +159,7 @@ def hypotheses_of(detection: Detection, fitted: FittedHand, count: int) -> Tenso
 
 
 def bent_pose(view: View) -> Tensor:
-    """(1, 27) a detection's likeliest pose, bent to the keypoints; (0, 27) of an empty detection.
+    """(1, 27) a detection's likeliest pose, bent to the keypoints; (0, 27) without a detection.
 
     Keypoints are more exact than hypotheses where a finger is seen, but no pose by themselves.
     """
@@ -170,21 +168,21 @@ def bent_pose(view: View) -> Tensor:
     pose = view.detection.states(view.fitted.ratio, 1)
     silhouette = pose.new_zeros(0, 0, dtype=torch.int32)
     nothing = SeenPoints(pose.new_zeros(0, 3), silhouette, view.observation.k, (0, 0))
-    keypoints = keypoints_of(view.detection, view.model.detector.settings, _BENT_M)
-    freely = _freely(view.model.refinement)
-    return view.fitted.refiner(pose, pose[:, 6:], nothing, freely, keypoints)
+    settings = _bending(view.model.refinement)
+    keypoints = view.keypoints_within(_BENT_M)
+    return view.fitted.refiner(pose, pose[:, 6:], nothing, settings, keypoints)
 
 
 @lru_cache
-def _freely(settings: Refinement) -> Refinement:
-    """The refinement by which a pose is bent to keypoints."""
+def _bending(settings: Refinement) -> Refinement:
+    """The settings of the refinement that bends a pose to keypoints."""
     return replace(settings, angle_rad=_BENT_RAD, iterations=_BENT_STEPS)
 
 
 def best_start(view: View) -> tuple[Tensor, float]:
-    """The best (1, 27) of the detector's poses, raw or refined, and its log posterior.
+    """The best (1, 27) of the detection's poses, raw or refined, and its log posterior.
 
-    The detection must not be empty.
+    view: with a detection.
     """
     model = view.model
     poses = hypotheses_of(view.detection, view.fitted, model.detector.settings.hypotheses)
@@ -198,10 +196,10 @@ def best_start(view: View) -> tuple[Tensor, float]:
 
 @dataclass(frozen=True, eq=False)
 class Hypotheses:
-    """A table of poses of one hand, a row each.
+    """N poses of one hand, each with its log posterior.
 
-    pose: (N, 27).  joints_m: (N, 21, 3).  detected: (N,) bool, by the pose network.
-    log_posterior: (N,).
+    pose: (N, 27).  joints_m: (N, 21, 3).  log_posterior: (N,).
+    detected: (N,) bool, whether the pose comes from the detector.
     """
 
     pose: Tensor
@@ -211,7 +209,7 @@ class Hypotheses:
 
 
 def propose(view: View, mean: Tensor) -> Hypotheses:
-    """Refined and scored hypotheses of a frame: the filter's `mean` (1, 27), its wrist with the
+    """The refined and scored hypotheses of a frame: the filter's `mean` (1, 27), its wrist with the
     last frame's fingers, and the detector's likeliest pose, bent to the keypoints.
 
     A covered hand has its last pose alone; without refinement there is `mean` alone. A pose that
@@ -234,19 +232,21 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
 
 
 def scored(view: View, poses: Tensor, detected: int = 0) -> Hypotheses:
-    """Poses (N, 27) as they are, scored; the last `detected` ones are the detector's."""
+    """Poses (N, 27) with their log posteriors; the last `detected` ones are the detector's."""
     joints = view.fitted.refiner.joints(poses)
     detectors = np.arange(len(poses)) >= len(poses) - detected
     return Hypotheses(poses, joints, detectors, view.log_posterior(poses))
 
 
 def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
-    """The best pose (1, 27) of a hand's scored hypotheses, where one of the detector must be better
-    by a margin; and whether the detector sees it elsewhere: the track is to restart there.
+    """The pose (1, 27) that becomes a frame's estimate, and whether the track restarts there.
 
-    table: with at least one row that is not the detector's.
+    It has the best posterior, where the detector's pose must be better by a margin. The track
+    restarts where it is a pose of the detector elsewhere than the others.
+
+    table: with at least one pose that is not the detector's.
     hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
-        be of what hides the hand, such as another hand.
+        be the pose of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
     joints, detected = table.joints_m.numpy(), table.detected

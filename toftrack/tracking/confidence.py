@@ -32,7 +32,9 @@ if TYPE_CHECKING:
 
 _FITTED = Path(__file__).parents[1] / "data" / "confidence.json"
 _LEAST = 1e-3
+"""Least score, and least probability, of which the log is taken."""
 _LIKELY = 0.03
+"""Hypotheses that are less probable are not compared with the estimate."""
 _NEAREST_M, _BEHIND_M = 0.05, 0.04
 """Least depth of a joint in projections; and how much nearer than a joint what hides it is."""
 _HIDDEN, _OUT_OF_VIEW = 0.3, 0.4
@@ -114,8 +116,11 @@ def confidence_features(
 
 @entry_point
 def compare_joints(joints, keypoints, sigma, hypotheses, depth, k, off):
-    """Of joints (21, 3): mean and largest distance from keypoints, the keypoints' mean deviation,
-    and the shares that are out of sight; their mean distances from hypotheses into `off` (H,).
+    """How joints (21, 3) agree with a detection and an image (H, W).
+
+    Returns their mean and largest distance from the keypoints, the keypoints' mean standard
+    deviation, and the shares of joints outside of the image and behind something. Writes into `off`
+    (H,) their mean distance from each hypothesis.
     """
     mean = most = unsure = 0.0
     for n in range(len(joints)):
@@ -213,7 +218,7 @@ KIND_OF_JOINT = np.array([0, 1, 2, 3, 4] + 4 * [5, 6, 7, 8])
 _KEYPOINTS = slice(0, 3)
 """The features that come from the network."""
 _BELOW_M = np.array([0.012, 0.010, 0.010, 0.008, 0.004] + 4 * [0.010, 0.008, 0.007, 0.004])
-"""How far joints are below the surface that a camera sees, roughly."""
+"""(21,) how far joints roughly are below the surface that a camera sees."""
 _AROUND_M = 0.006
 """Distance of the readings about a joint."""
 _LEAST_CM, _MOST_CM = 0.1, 30.0
@@ -286,14 +291,14 @@ def joint_features(
         keypoints = detection.keypoints
         compare_keypoints(joints_m, keypoints.points_m.numpy(), keypoints.sigma_m.numpy(), features)
     look_around(joints_m, image.depth_m, image.k.astype(np.float64), _BELOW_M, features)
-    features[:, 7] = -math.log(max(score, _LEAST))
-    features[:, 9] = np.logaddexp(0.0, -log_odds)
+    features[:, JOINT_FEATURES.index("misfit")] = -math.log(max(score, _LEAST))
+    features[:, JOINT_FEATURES.index("doubt")] = np.logaddexp(0.0, -log_odds)
     return features
 
 
 @entry_point
 def compare_keypoints(joints, keypoints, sigma, features):
-    """The first three of JOINT_FEATURES of joints (21, 3), from the network's keypoints."""
+    """Write the first three of JOINT_FEATURES of joints (21, 3), from the network's keypoints."""
     mean = 0.0
     for n in range(len(joints)):
         away = distance(joints[n], keypoints[n])
@@ -309,9 +314,9 @@ def compare_keypoints(joints, keypoints, sigma, features):
 
 @entry_point
 def look_around(joints, depth, k, below, features):
-    """What is seen about joints (21, 3): outside, unread, behind, before, pixel.
+    """Write what the image shows about joints (21, 3): outside, unread, behind, before, pixel.
 
-    Of a joint 3 x 3 readings are taken, and their median.  below: (21,) m, see _BELOW_M.
+    By 3 x 3 readings about each joint and their median.  below: (21,) m, see _BELOW_M.
     """
     near = np.empty(9)
     for n in range(len(joints)):

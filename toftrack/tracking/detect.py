@@ -18,18 +18,18 @@ from toftrack.tracking.sides import comparison_due
 from toftrack.tracking.state import NO_PLACES, OTHER_SIDE, TrackerState
 
 _RARE_S = 0.1
-"""Frames farther apart are rare: predictions say little, so that the finder looks first."""
+"""Frames farther apart than this are rare: predictions are inexact, so the finder looks first."""
 _ARM_M, _ARM_RADIUS_M = 0.3, 0.06
 """Length and radius of a forearm with its sleeve, at most."""
 _FOLLOWED = 2
-"""While every track is reliable the finder, which takes a fifth of a frame's time, is asked so much
-more rarely."""
+"""By this factor the finder, which takes a fifth of a frame's time, is asked more rarely while
+every track is reliable."""
 _UNSHOWN = 3
-"""A hand that no slot shows is looked at in every so manieth frame: all that it is followed for is
-to know it from the hand that is shown."""
+"""Frames from one look at a sure hand that no slot shows to the next: such a hand is followed only
+to tell it from the hands that are shown."""
 _AS_WELL, _WELL_M = 1.3, 0.02
-"""Hands are seen about as well as the best one when their expected errors are less than so many
-times its error, or than this."""
+"""A hand is seen about as well as the best one when its expected error is less than so many times
+the best one's, or less than the latter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,8 +92,8 @@ def finish_detection(
 
 
 def rests(scene: Scene, row: int, state: TrackerState) -> bool:
-    """Whether a track is only moved on in this frame: a sure one, which no slot shows, but in every
-    third frame.
+    """Whether a track is only moved on in this frame: a sure one that no slot shows and that the
+    pose network looked at lately.
     """
     track = scene.hands[row].track
     waited = Duration(track.asked_s).reached(_UNSHOWN)
@@ -106,7 +106,7 @@ def _is_sure(scene: Scene, row: int) -> bool:
 
 
 def _is_asked(scene: Scene, row: int, state: TrackerState) -> bool:
-    """Whether the pose network looks at a track; it skips frames of sure ones."""
+    """Whether the pose network looks at a track in this frame; at sure ones it looks rarely."""
     if rests(scene, row, state):
         return False
     track, every = scene.hands[row].track, scene.model.detector.settings.every
@@ -115,8 +115,8 @@ def _is_asked(scene: Scene, row: int, state: TrackerState) -> bool:
 
 
 def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
-    """A function that waits for the detection at a predicted hand, started here; with the other
-    side's where a comparison is due.
+    """A function that waits for the detection at a predicted hand, where a comparison is due also
+    for the detection there as a hand of the other side. Both are started here.
     """
     hand, image = scene.hands[row], scene.image_for(row)
     at = image.depth_m, image.k, hand.palm_m
@@ -131,7 +131,11 @@ def _start(scene: Scene, row: int) -> Callable[[], SideDetection]:
 def _elsewhere(
     scene: Scene, state: TrackerState, places: Places, rare: bool
 ) -> list[SideDetection]:
-    """Detections at the finder's places as hands of each missing side, by merit or as held out."""
+    """The detections at the finder's places as hands of each missing side, those of the largest
+    merit first; while there is no track and nobody said a side, see held_out_first.
+
+    rare: the last frame was long ago, see _RARE_S.
+    """
     tracks = [hand.track for hand in scene.hands]
     missing = {track.side for track in tracks if rare or not track.reliable}
     confirmed = [track for track in tracks if track.confirmed]
@@ -158,9 +162,11 @@ def _elsewhere(
 
 
 def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]]:
-    """The arms of detected hands, but for those of low merit, and of reliable tracks that nobody
-    looked at; and the merit up to which a detection there is the arm: of a track that is not
-    reliable its own, for that may be the arm, and the detection its hand.
+    """Arms, each with the merit up to which a detection on it is taken for the arm itself.
+
+    They are those of hands `seen` at tracks, if their merit is not low, and of reliable tracks that
+    nobody looked at. A track that is not reliable may itself be on an arm, and the detection be the
+    hand: only a detection of less merit than the track's own is then taken for the arm.
     """
     arms = []
     for one in seen:
@@ -177,7 +183,7 @@ def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]
 
 
 def _is_on(arm: Arm, detection: Detection) -> bool:
-    """Whether a detected palm lies on an arm: then it is that arm, which may look like a hand."""
+    """Whether a detected palm lies on an arm, which may itself look like a hand."""
     away = detection.centre_m.numpy() - arm[0]
     along = float(away @ arm[1])
     beside = float(np.linalg.norm(away - along * arm[1]))
@@ -185,7 +191,7 @@ def _is_on(arm: Arm, detection: Detection) -> bool:
 
 
 def _apart_from(known: Sequence[np.ndarray], places: Places) -> Places:
-    """The places that are farther than SAME_PLACE_M from each known one (3,)."""
+    """The places that are farther than SAME_PLACE_M from each known point (3,)."""
     rows = [
         row
         for row, at in enumerate(places.centre_m)

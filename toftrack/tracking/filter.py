@@ -24,16 +24,17 @@ from toftrack.tracking.posterior import ImageTerm
 from toftrack.tracking.state import ParticleSet, Track, changed, generator_on
 
 _MOVEMENT_S = 0.3
-"""How long a movement goes on (to 1/e)."""
+"""Time in which a predicted movement fades to 1/e."""
 _APPROACH_M_S, _NEAREST_M = 0.05, 0.15
-"""How much faster than its wrist the nearest joint of a partly hidden hand may come nearer; and no
-palm is predicted nearer than that: no camera sees it there."""
+"""How much faster than its wrist the nearest joint of a partly hidden hand may approach the camera;
+and the least depth of a predicted palm: no camera sees one nearer."""
 
 
 def predicted_motion(track: Track, dt_s: float, settings: FilterSettings) -> Tensor:
     """(6 + d,) the tangent by which a hand is expected to move in dt_s.
 
-    Of what its velocity means, `settings.velocity` is expected in the first FRAME_S, later less.
+    In FRAME_S it is the share `settings.velocity` of the motion by the track's velocity; over a
+    longer time the share is smaller.
     """
     reach_s = FRAME_S * math.expm1(-dt_s / _MOVEMENT_S) / math.expm1(-FRAME_S / _MOVEMENT_S)
     return track.velocity * (settings.velocity * reach_s)
@@ -60,7 +61,7 @@ class PredictedHand:
 
 
 def predict(track: Track, dt_s: float, model: FilterModel) -> PredictedHand:
-    """A track's hand dt_s after its last frame: moved on, its finger angles as they were."""
+    """A track's hand dt_s after its last frame: its wrist moved on, its finger angles unchanged."""
     fitted = model.hand(track.side, track.shape)
     moved = predicted_motion(track, dt_s, model.filter)
     tangent = torch.cat((moved[:6], moved.new_zeros(21)))[None]
@@ -110,28 +111,27 @@ def run_filter(
         with spans("filter: scoring"):
             return model.likelihood.log_score(model.backend.score_rows(scorers, poses, evidences))
 
-    moves = [predicted_motion(track, dt_s, model.filter) for track in tracks]
+    cfg, frames = model.filter, dt_s / FRAME_S
+    moves = [predicted_motion(track, dt_s, cfg) for track in tracks]
     given = zip(tracks, moves, strict=True)
+    # Of the first diffusion, which is wider the more a hand is expected to move.
+    sigmas = [
+        particle_filter.widened(model.sigmas, frames, moved, cfg.rest, cfg.speed_gain)
+        for moved in moves
+    ]
     particles, weights = particle_filter.annealed(
         torch.stack([_moved(track.cloud.particles, moved, model) for track, moved in given]),
         torch.stack([track.cloud.weights for track in tracks]),
-        on_device(torch.stack([_sigmas(moved, dt_s, model) for moved in moves]), model.device),
+        on_device(torch.stack(sigmas), model.device),
         log_scores,
         space.lower,
         space.upper,
-        model.filter,
+        cfg,
         motions.redraw,
         [generator_on(model.device, generator) for generator in generators],
     )
     rows = zip(particles, weights, strict=True)
     return [ParticleSet(*row, motions.mean(*row)) for row in rows]
-
-
-def _sigmas(moved: Tensor, dt_s: float, model: FilterModel) -> Tensor:
-    """(6 + d,) of the first diffusion of a hand that is expected to move by a tangent (6 + d,)."""
-    settings = model.filter
-    frames = dt_s / FRAME_S
-    return particle_filter.widened(model.sigmas, frames, moved, settings.rest, settings.speed_gain)
 
 
 def _moved(particles: Tensor, tangent: Tensor, model: FilterModel) -> Tensor:

@@ -41,21 +41,24 @@ from toftrack.tracking.state import (
 )
 
 _OTHER = 0.4
-"""A hand that is less probably of the side that the user said is flagged as another one."""
+"""A hand that is of the side that the user said with less than this probability is flagged as
+another one."""
 _STAYS, _CONFIRMED, _MOST = 2.0, 6.0, 3.0
 """Worth of a track to a slot, log odds: for being there before, for being confirmed, and, at most,
 for its log odds and for its side. With 4 for being there, an elbow kept the only slot after
 something had hidden the hand."""
 _GONE_S = 2.0
-"""Where no side was said, one of the other side takes the place of a hand away for so long."""
+"""Where no side was said, a hand of the other side takes the only slot when none was believed there
+for so long."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrackResult:
-    """A track after a frame.
+    """A track after a frame, and what its estimate is made of.
 
-    view: before it.  filtered: the particles, before they followed the pose.
-    score: the F-measure of its pose, 0 .. 1.
+    view: the track's view in the frame, with the track as it was before.
+    filtered: its particles, before they were shifted to the pose.
+    score: the F-measure of its pose, 0 .. 1.  status: of its estimate.
     """
 
     view: View
@@ -202,7 +205,9 @@ def with_side(estimate: Estimate, side: str, right: float, wanted: str | None) -
 def report_absence(
     slot: Slot, image: DepthImage, model: FilterModel, count: int
 ) -> tuple[Slot, Estimate]:
-    """A slot without result, and a lost estimate: NaN, or of the only slot its last one."""
+    """A slot without a result, and its lost estimate: the only slot repeats its last one, one of
+    several has NaN.
+    """
     nothing = no_estimate(image.index, image.timestamp_s, "lost", model.space.dims, math.nan)
     if count > 1:
         return changed(slot, gesture=None), nothing

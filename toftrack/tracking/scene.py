@@ -21,12 +21,12 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.state import Track
 
 _TOLERANCE_M, _EDGE_M = np.float32(0.02), np.float32(0.06)
-"""A pixel whose depth is so near to a predicted surface is that hand's; those on its outline, which
-mix its depth with what is behind, are up to the latter farther."""
+"""A pixel is a hand's if its depth differs by less than the former from the predicted surface's.
+Pixels beside the outline, which mix that with what is behind, may be farther by the latter."""
 _FAR_M = 5.0
 """Depth of removed pixels: the detector sees nothing so far away."""
 _IN_FRONT_M = 0.03
-"""What is nearer than a hand's wrist by more than this may hide the hand."""
+"""What is nearer to the camera than a hand's wrist by more than this may hide the hand."""
 
 
 Arm = tuple[np.ndarray, np.ndarray]
@@ -86,9 +86,10 @@ class Scene:
         return (self.owners >= 0) & (self.owners != row) if any(others) else None
 
     def image_for(self, row: int) -> DepthImage:
-        """The image for the pose network at a hand: without the pixels of other hands, or keypoints
-        lie on their fingers, but for those in front of it: the network knows what hides a hand.
-        A new hand's, row -1: without all of them.
+        """The image that the pose network sees of the hand of a row, -1 = of a new one.
+
+        It is without the pixels of other hands, or keypoints would lie on their fingers. Those in
+        front of the hand stay, as the network knows what hides a hand; but none for a new one.
         """
         if row < 0:
             return self.unexplained
@@ -144,7 +145,9 @@ def _points_at(
 
 @entry_point
 def _remove(depth, pixels, far, left):
-    """What is left, (H, W), of an image without pixels (h, w) of the reduced one: they are far."""
+    """Copy an image (H, W) into `left`, with the depth `far` at `pixels` (h, w) of the reduced
+    image.
+    """
     height, width = depth.shape
     down, across = pixels.shape[0] / height, pixels.shape[1] / width
     for v in range(height):

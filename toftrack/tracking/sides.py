@@ -59,10 +59,11 @@ neither pose is the hand's, and which one explains more of the image is chance."
 def side_log_odds(track: Track, tracks: Sequence[Track], told: str | None) -> float:
     """Log odds that a track is a right hand, by its evidence, the body, its partner and the user.
 
-    tracks: all, of which the other confirmed ones count: a person's two hands are not of one side.
+    tracks: all. The other confirmed one, if there is just one, is the partner: a person's two hands
+        are of different sides.
     told: the side that the user said, of a hand that is seen alone.
 
-    A partner counts by how probable it is that it is a hand, and what was said by the rest.
+    With the probability that the partner is a hand, the partner counts; else what the user said.
     """
     total = track.evidence.fits + track.evidence.body
     others = [one for one in tracks if one.confirmed and one.number != track.number]
@@ -84,7 +85,7 @@ def comparison_due(track: Track) -> bool:
 
 
 def compare_sides(view: View, mirrored: Detection, image: DepthImage, arm: Arm) -> SideEvidence:
-    """A track's evidence after one more comparison; as it was where hardly a hand is detected.
+    """A track's evidence after one more comparison, or as it was where hardly a hand is detected.
 
     mirrored: the detection there as a hand of the other side.  image: without other hands.
     arm: the hand's.
@@ -123,8 +124,10 @@ def _best_of_side(view: View, detection: Detection, side: str) -> float:
 def _start_turned_looks(
     mirrored: Detection, side: str, image: DepthImage, model: TrackerModel
 ) -> Callable[[], float]:
-    """A function that waits for the log odds by which the network is surer of `side` in crops of
-    the other side's pose: a crop that is turned as a pose has it makes that pose's side likelier.
+    """A function that waits for the network's log odds of `side` against the other side, in crops
+    that are turned as the pose of the other side has it.
+
+    A crop that is turned as a pose of one side has it makes that side likelier; so both are asked.
     """
     at = image.depth_m, image.k, mirrored.centre_m.numpy()
     own, other = (model.detector.start(*at, one, mirrored.up) for one in (side, OTHER_SIDE[side]))

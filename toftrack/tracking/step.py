@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import compress
 
 import torch
 
@@ -98,7 +97,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
 
 
 def rest_track(scene: Scene, row: int) -> Track:
-    """The track of a row after a frame in which it is only moved on."""
+    """The track of a row after a frame in which nothing is compared with it: moved as predicted."""
     hand, dt_s = scene.hands[row], scene.dt_s
     track = hand.track
     return changed(
@@ -131,21 +130,20 @@ def filter_tracks(
     What is drawn for a track depends on its number, not on which others there are.
     """
     dt_s, model = scene.dt_s, scene.model
-    chosen = [state.shows(view.track) or not view.track.reliable for view in views]
-    filtered = list(compress(views, chosen))
-    tracks, images = [view.track for view in filtered], [view.image for view in filtered]
+    chosen = [view for view in views if state.shows(view.track) or not view.track.reliable]
+    tracks, images = [view.track for view in chosen], [view.image for view in chosen]
     generators = [torch.Generator().manual_seed(seed + track.number) for track in tracks]
-    found = iter(run_filter(tracks, dt_s, images, model, generators, spans))
-    return {
-        view.track.cloud: next(found) if one else predict_particles(view.track, dt_s, model)
-        for view, one in zip(views, chosen, strict=True)
+    found = run_filter(tracks, dt_s, images, model, generators, spans)
+    moved = [view.track for view in views if view not in chosen]
+    return {track.cloud: predict_particles(track, dt_s, model) for track in moved} | {
+        track.cloud: filtered for track, filtered in zip(tracks, found, strict=True)
     }
 
 
 def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) -> TrackResult:
-    """A track after a frame, with its chosen pose and what is thought of it.
+    """The result of a view: its track after the frame, with its pose and how sure that is.
 
-    filtered: its particles in this frame.
+    filtered: the track's particles in this frame.
     """
     model, track, dt_s = view.model, view.track, scene.dt_s
     motions, refines = model.backend.motions, model.refinement.iterations > 0
@@ -187,7 +185,7 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
 
 
 def learn_shape(view: View, pose: torch.Tensor) -> shape_fit.ShapeEstimate:
-    """The shape estimate of a track, updated by a pose that is believed, if nothing hides it."""
+    """The shape estimate of a view's track after a believed pose; as before where it is hidden."""
     shape, fitted, model = view.track.shape, view.fitted, view.model
     unknown = view.detection.empty or view.hidden or shape.applied != fitted.applied
     if unknown or not model.fits:

@@ -22,7 +22,7 @@ from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState, changed
 
 _SPARE = 1
-"""So many tracks may exist beyond the slots, or beyond the two hands of a person."""
+"""How many more tracks may exist than slots, or than the two hands of a person."""
 
 
 def predicted_view(scene: Scene, row: int) -> View | None:
@@ -53,7 +53,7 @@ def continue_track(
 
 
 def max_new_tracks(state: TrackerState) -> int:
-    """How many tracks may begin: no more are tentative than hands are missing, or one."""
+    """How many tracks may begin, so that no more are tentative than hands are missing, or one."""
     confirmed = sum(track.confirmed for track in state.tracks)
     most = max(len(state.slots), 2)
     tentative = len(state.tracks) - confirmed
@@ -61,7 +61,7 @@ def max_new_tracks(state: TrackerState) -> int:
 
 
 def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerState) -> View | None:
-    """The view of a new tentative track of a number; None where no hand can be."""
+    """The view of a new tentative track with a number; None where no hand can be."""
     model, detection, image = scene.model, one.detection, scene.unexplained
     nothing, shape = torch.zeros(1, 6 + model.space.dims), known_shape(one.side, state)
     cloud, pose = ParticleSet(nothing, nothing[:, 0], nothing), torch.zeros(1, 27)
@@ -76,7 +76,9 @@ def begin_track(scene: Scene, one: SideDetection, number: int, state: TrackerSta
 
 
 def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
-    """The shape in the first vacant slot of a side; the population's where there is none."""
+    """The shape of the last hand in the first slot of a side that has no track now; the mean of the
+    population where there is no such slot.
+    """
     numbers = {track.number for track in state.tracks}
     vacant = (slot for slot in state.slots if slot.track not in numbers and slot.side == side)
     return next((slot.shape for slot in vacant), first_shape())
@@ -105,7 +107,11 @@ def make_view(scene: Scene, row: int, track: Track, detection: Detection) -> Vie
 
 
 def choose_side(scene: Scene, row: int, view: View, mirrored: Detection, told: str | None) -> View:
-    """The view with its sides compared; restarted as the other side where that one is likelier."""
+    """The view after a comparison of its sides; restarted as a hand of the other side where that is
+    likelier.
+
+    mirrored: the detection there as a hand of the other side.  told: the side that the user said.
+    """
     arm = scene.arm(view.detection)
     evidence = compare_sides(view, mirrored, scene.image_for(row), arm)
     track, tracks = changed(view.track, evidence=evidence), [hand.track for hand in scene.hands]
