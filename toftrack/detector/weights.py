@@ -129,14 +129,14 @@ def _read(
             raise ToftrackError(f"{path} is too large for weights of the detector; {_AGAIN}")
         arrays = read_archive(path, names)
         metadata = parse_json(str(arrays.pop("metadata")))
+        if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
+            raise ValueError(f"its metadata do not say {FORMAT}")
     except FileNotFoundError:
         raise ToftrackError(f"there are no weights of the detector at {path}; {_AGAIN}") from None
     except (OSError, ValueError, KeyError) as error:
         raise ToftrackError(
             f"{path} is no file of the detector's weights ({error}); {_AGAIN}"
         ) from None
-    if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-        raise ToftrackError(f"{path} is no file of the detector's weights; {_AGAIN}")
     if metadata.get("version") != VERSION:
         raise ToftrackError(
             f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"

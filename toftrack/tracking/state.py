@@ -64,13 +64,17 @@ class ParticleSet:
     mean: Tensor
 
 
+NO_TREND = torch.full((27,), math.nan)
+"""The trend of a track that has no second frame yet."""
+
+
 @dataclass(frozen=True, eq=False)
 class Track:
     """A hand that is followed.
 
     cloud: after the last observation.  velocity: (6 + d,) its mean's smoothed change a second.
     pose: (1, 27) the last estimate; at the start, what the track begins with.
-    trend: (27,) its mean change a second, see refinement/steadying.py; NaN at the start.
+    trend: (27,) its mean change a second, see refinement/steadying.py.
     number: unique.  side: right or left, with the `evidence`.
     age: since it began or restarted.
     likely, doubtful: how long it reached ConfidenceModel.believe, and was below its give_up.
@@ -88,7 +92,7 @@ class Track:
     cloud: ParticleSet
     velocity: Tensor
     pose: Tensor
-    trend: Tensor = field(default_factory=lambda: torch.full((27,), math.nan))
+    trend: Tensor = NO_TREND
     number: int = 0
     side: str = "right"
     evidence: SideEvidence = SideEvidence()

@@ -18,7 +18,6 @@ from toftrack.tracking.candidates import View, propose, select, with_parts
 from toftrack.tracking.confidence import confidence_features, judge
 from toftrack.tracking.detect import finish_detection, rests, start_detection
 from toftrack.tracking.filter import (
-    new_track,
     predict_particles,
     run_filter,
     shift_particles,
@@ -27,7 +26,7 @@ from toftrack.tracking.filter import (
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import StepResult, TrackResult, report
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.state import ParticleSet, Track, TrackerState, changed
+from toftrack.tracking.state import NO_TREND, ParticleSet, Track, TrackerState, changed
 from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
 
 
@@ -150,10 +149,8 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     with spans("refinement"):
         pose, moved = select(propose(view, model.decode(filtered.mean)), view.hidden)
     if moved:
-        fresh = new_track(pose, model)
-        track = changed(
-            track, age=fresh.age, likely=fresh.likely, doubtful=fresh.doubtful, trend=fresh.trend
-        )
+        new = Duration()
+        track = changed(track, age=new, likely=new, doubtful=new, trend=NO_TREND)
     elif refines:
         pose, trend = steadied(pose, track.pose, track.trend, dt_s, motions)
         track = changed(track, trend=trend)

@@ -16,10 +16,8 @@ from toftrack.errors import MOST_HANDS, ToftrackError, check_number
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import DepthImage, checked_image, checked_moment
 from toftrack.hand.shape import HandShape, default_hand_shape
-from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import PoseSpace
-from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import model_range_image
 from toftrack.render.scoring import Scorer
 from toftrack.tracking.model import FilterModel, TrackerModel
 from toftrack.tracking.paper import PaperModel, paper_step
@@ -220,10 +218,8 @@ def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepRes
 
 def _rendered_hand() -> DepthImage:
     """A small image of an open hand before a wall."""
-    shape, (height, width) = default_hand_shape(), _RENDERED_PX
-    state = torch.zeros(1, 27)
-    state[0, 1:3] = torch.tensor([0.08, 0.5])
-    k = torch.tensor([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
-    hand = hand_surface(shape).pose(forward_kinematics(state, shape))
-    depth = render_range_images(hand, k, height, width)[0]
-    return DepthImage(torch.where(depth > 0, depth, 1.5).numpy(), k.double().numpy(), 0, 0.0)
+    pose, (height, width) = np.zeros(27, np.float32), _RENDERED_PX
+    pose[1:3] = 0.08, 0.5
+    k = np.array([[110.0, 0, width / 2], [0, 110.0, height / 2], [0, 0, 1]])
+    depth = model_range_image(pose, default_hand_shape(), k, height, width)
+    return DepthImage(np.where(depth > 0, depth, np.float32(1.5)), k, 0, 0.0)

@@ -79,8 +79,7 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
     """The shape of the last hand in the first slot of a side that has no track now; the mean of the
     population where there is no such slot.
     """
-    numbers = {track.number for track in state.tracks}
-    vacant = (slot for slot in state.slots if slot.track not in numbers and slot.side == side)
+    vacant = (slot for slot in state.slots if slot.side == side and not state.track_of(slot))
     return next((slot.shape for slot in vacant), first_shape())
 
 
