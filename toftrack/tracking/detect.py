@@ -136,20 +136,8 @@ def _elsewhere(
 
     rare: the last frame was long ago, see _RARE_S.
     """
-    tracks = [hand.track for hand in scene.hands]
-    missing = {track.side for track in tracks if rare or not track.reliable}
-    confirmed = [track for track in tracks if track.confirmed]
-    slots = len(state.slots)
-    if slots > 2 and sum(track.reliable for track in tracks) >= slots:
-        return []  # all hands that are asked for are found
-    if slots > 2 or (not tracks and (slots > 1 or not state.told)):
-        missing = set(OTHER_SIDE)
-    elif not tracks:
-        missing = {str(state.told)}
-    elif len(confirmed) == 1 and confirmed[0].reliable:  # else what is seen may be its hand
-        missing.add(OTHER_SIDE[confirmed[0].side])
     seen: list[SideDetection] = []
-    for side in sorted(missing, reverse=True):  # right first
+    for side in sorted(_missing_sides(scene, state, rare), reverse=True):  # right first
         # A hand that is hardly seen may look like one of the other side.
         others = [hand.palm_m for hand in scene.hands if hand.track.side != side and not rare]
         there = _apart_from(others, places)
@@ -158,7 +146,21 @@ def _elsewhere(
             found = scene.model.detector.look(image.depth_m, image.k, there, side)
             seen += [SideDetection(one, side) for one in found]
     seen.sort(key=lambda one: -one.detection.merit)
-    return seen if tracks or state.told else held_out_first(seen)
+    return seen if scene.hands or state.told else held_out_first(seen)
+
+
+def _missing_sides(scene: Scene, state: TrackerState, rare: bool) -> set[str]:
+    """The sides of hands that are looked for at the finder's places.  rare: see _elsewhere."""
+    tracks, slots = [hand.track for hand in scene.hands], len(state.slots)
+    if slots > 2:  # of any side, until all hands that are asked for are found
+        return set() if sum(track.reliable for track in tracks) >= slots else set(OTHER_SIDE)
+    if not tracks:
+        return {state.told} if slots == 1 and state.told else set(OTHER_SIDE)
+    missing = {track.side for track in tracks if rare or not track.reliable}
+    confirmed = [track for track in tracks if track.confirmed]
+    if len(confirmed) == 1 and confirmed[0].reliable:  # else what is seen may be its hand
+        missing.add(OTHER_SIDE[confirmed[0].side])
+    return missing
 
 
 def _arms(scene: Scene, seen: Sequence[SideDetection]) -> list[tuple[Arm, float]]:
