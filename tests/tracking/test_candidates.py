@@ -214,7 +214,7 @@ def chosen(*rows: tuple[float, float, bool, float], hidden: bool = False) -> tup
     joints = place[:, None, None].repeat(1, 21, 3) / math.sqrt(3)
     joints[:, 5:9] += finger[:, None, None] / math.sqrt(3)
     poses = torch.arange(len(rows))[:, None] * torch.ones(27)
-    pose, moved = select(Hypotheses(poses, joints, detected.numpy(), value), hidden)
+    pose, moved = select(Hypotheses(poses, detected.numpy(), value), joints, hidden)
     return int(pose[0, 0]), moved
 
 

@@ -32,8 +32,8 @@ from toftrack.tracking.views import (
     begin_track,
     continue_track,
     known_shape,
+    make_view,
     max_new_tracks,
-    predicted_view,
     update_shape,
 )
 
@@ -64,7 +64,7 @@ def gone_on(
 ) -> View | None:
     track = track_of(HERE, number=3, **changes)
     scene = scene_of(track, image=image, model=model())
-    return continue_track(scene, 0, predicted_view(scene, 0), found, told)
+    return continue_track(scene, 0, make_view(scene, 0, scene.hands[0].track), found, told)
 
 
 @pytest.mark.parametrize("found", [seen(HERE, row=0), seen(hand_at(0.02)), seen(HERE)])
@@ -98,7 +98,8 @@ def test_a_track_does_not_go_on_where_nothing_can_be_its_hand(found: SideDetecti
 
 def test_the_time_since_a_comparison_and_since_the_last_look_goes_on() -> None:
     track = track_of(HERE, asked_s=0.1, evidence=SideEvidence(1.0, age_s=0.3))
-    view = predicted_view(scene_of(track, image=BOTH, model=model()), 0)
+    scene = scene_of(track, image=BOTH, model=model())
+    view = make_view(scene, 0, scene.hands[0].track)
     assert view is not None and view.detection.empty
     assert view.track.evidence.age_s == pytest.approx(0.34)
     assert view.track.asked_s == pytest.approx(0.14)

@@ -198,12 +198,11 @@ def best_start(view: View) -> tuple[Tensor, float]:
 class Hypotheses:
     """N poses of one hand, each with its log posterior.
 
-    pose: (N, 27).  joints_m: (N, 21, 3).  log_posterior: (N,).
+    pose: (N, 27).  log_posterior: (N,).
     detected: (N,) bool, whether the pose comes from the detector.
     """
 
     pose: Tensor
-    joints_m: Tensor
     detected: np.ndarray
     log_posterior: Tensor
 
@@ -224,32 +223,28 @@ def propose(view: View, mean: Tensor) -> Hypotheses:
     previous = torch.cat((mean[:, :6], view.track.pose[:, 6:]), 1)
     poses = torch.cat((previous, mean, detected))
     table = scored(view, view.refine(poses), len(detected))
-    nothing = table.log_posterior.isneginf()
-    if not nothing.any():
-        return table
-    pose = torch.where(nothing[:, None], poses, table.pose)
-    return replace(table, pose=pose, joints_m=view.fitted.refiner.joints(pose))
+    nothing = table.log_posterior.isneginf()[:, None]
+    return replace(table, pose=torch.where(nothing, poses, table.pose))
 
 
 def scored(view: View, poses: Tensor, detected: int = 0) -> Hypotheses:
     """Poses (N, 27) with their log posteriors; the last `detected` ones are the detector's."""
-    joints = view.fitted.refiner.joints(poses)
     detectors = np.arange(len(poses)) >= len(poses) - detected
-    return Hypotheses(poses, joints, detectors, view.log_posterior(poses))
+    return Hypotheses(poses, detectors, view.log_posterior(poses))
 
 
-def select(table: Hypotheses, hidden: bool) -> tuple[Tensor, bool]:
+def select(table: Hypotheses, joints_m: Tensor, hidden: bool) -> tuple[Tensor, bool]:
     """The pose (1, 27) that becomes a frame's estimate, and whether the track restarts there.
 
     It has the best posterior, where the detector's pose must be better by a margin. The track
     restarts where it is a pose of the detector elsewhere than the others.
 
-    table: with at least one pose that is not the detector's.
+    table: with at least one pose that is not the detector's.  joints_m: (N, 21, 3) of its poses.
     hidden: something hides part of the hand. Then a pose elsewhere needs a large lead, for it may
         be the pose of what hides the hand, such as another hand.
     """
     # In numpy: on a few rows each of torch's operations takes longer than its arithmetic.
-    joints, detected = table.joints_m.numpy(), table.detected
+    joints, detected = joints_m.numpy(), table.detected
     values = np.maximum(table.log_posterior.numpy(), WORST)
     base = int(np.where(detected, -np.inf, values).argmax())
     away = np.sqrt(np.square(joints - joints[base]).sum(-1)).mean(1)

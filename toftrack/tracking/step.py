@@ -27,7 +27,7 @@ from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.report import StepResult, TrackResult, report
 from toftrack.tracking.scene import Scene
 from toftrack.tracking.state import NO_TREND, ParticleSet, Track, TrackerState, changed
-from toftrack.tracking.views import begin_track, continue_track, max_new_tracks, predicted_view
+from toftrack.tracking.views import begin_track, continue_track, make_view, max_new_tracks
 
 
 @small_operations()
@@ -58,7 +58,10 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
         rows = range(len(scene.hands))
         pending = start_detection(scene, state)
         resting = [rests(scene, row, state) for row in rows]
-        predicted = [None if resting[row] else predicted_view(scene, row) for row in rows]
+        predicted = [
+            None if resting[row] else make_view(scene, row, hand.track)
+            for row, hand in enumerate(scene.hands)
+        ]
     with spans("filter: rest"):
         seed = int(torch.randint(2**62, (1,), generator=generator))
         expected = [view and with_parts(view) for view in predicted]
@@ -147,7 +150,8 @@ def update_track(view: View, filtered: ParticleSet, scene: Scene, spans: Spans) 
     model, track, dt_s = view.model, view.track, scene.dt_s
     motions, refines = model.backend.motions, model.refinement.iterations > 0
     with spans("refinement"):
-        pose, moved = select(propose(view, model.decode(filtered.mean)), view.hidden)
+        table = propose(view, model.decode(filtered.mean))
+        pose, moved = select(table, view.fitted.refiner.joints(table.pose), view.hidden)
     if moved:
         new = Duration()
         track = changed(track, age=new, likely=new, doubtful=new, trend=NO_TREND)

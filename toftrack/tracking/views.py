@@ -25,11 +25,6 @@ _SPARE = 1
 """How many more tracks may exist than slots, or than the two hands of a person."""
 
 
-def predicted_view(scene: Scene, row: int) -> View | None:
-    """The view of a track where it is predicted, without detection; None where no hand can be."""
-    return make_view(scene, row, scene.hands[row].track, NO_DETECTION)
-
-
 def continue_track(
     scene: Scene, row: int, view: View | None, seen: SideDetection, told: str | None
 ) -> View | None:
@@ -83,7 +78,9 @@ def known_shape(side: str, state: TrackerState) -> ShapeEstimate:
     return next((slot.shape for slot in vacant), first_shape())
 
 
-def make_view(scene: Scene, row: int, track: Track, detection: Detection) -> View | None:
+def make_view(
+    scene: Scene, row: int, track: Track, detection: Detection = NO_DETECTION
+) -> View | None:
     """The view of a track where it is detected, or without a detection where it is predicted; None
     where no hand can be.  row: of the track's prediction, -1 = of a new track.
     """
