@@ -25,7 +25,7 @@ from toftrack.tracking.candidates import View
 from toftrack.tracking.confidence import LogOdds
 from toftrack.tracking.filter import predict_particles
 from toftrack.tracking.report import TrackResult
-from toftrack.tracking.state import ParticleSet, Track, TrackerState
+from toftrack.tracking.state import ParticleSet, Track
 from toftrack.tracking.step import filter_tracks, step, update_track
 
 HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
@@ -156,21 +156,14 @@ def test_particles_are_filtered_before_a_detection_is_waited_for(
     assert order.index("waited") == model.filter.passes
 
 
-def going_on(*tracks: Track) -> TrackerState:
-    numbered = [replace(track, number=at) for at, track in enumerate(tracks)]
-    return keep_tracks(state_of(), numbered, right_hand_model())
-
-
-def numbers(*tracks: Track) -> list[int]:
-    return [track.number for track in going_on(*tracks).tracks]
-
-
 FIST = HERE.clone()
 FIST[0, 2] += 0.015
 for finger in range(12, 27, 4):
     FIST[0, finger : finger + 3] = 1.3
 SURE, LESS_SURE = track_of(HERE, log_odds=4.0), track_of(HERE, log_odds=3.0)
 NEW = {"confirmed": False, "age": Duration(FRAME_S)}
+LONG_DOUBTED = {"doubtful": Duration(1.0)}
+WAITING = track_of(THERE, confirmed=False, age=Duration(0.6))
 
 
 @pytest.mark.parametrize(
@@ -184,6 +177,10 @@ NEW = {"confirmed": False, "age": Duration(FRAME_S)}
         ((SURE, LESS_SURE, track_of(HERE, log_odds=5.0)), [2]),
         ((SURE, track_of(hand_at(0.05), log_odds=3.0)), [0, 1]),
         ((SURE, track_of(THERE, **NEW)), [0, 1]),
+        ((track_of(HERE, **LONG_DOUBTED), track_of(THERE, **LONG_DOUBTED, **NEW)), []),
+        ((SURE, WAITING), [0]),
+        ((WAITING,), [0]),
+        ((WAITING, track_of(HERE, confirmed=False)), [0, 1]),
     ],
     ids=[
         "the surer one",
@@ -194,24 +191,18 @@ NEW = {"confirmed": False, "age": Duration(FRAME_S)}
         "of three one is left",
         "two that lie beside each other go on",
         "and two that are apart",
+        "what nobody sees ends, whether it was a hand or not",
+        "a tentative one ends beside a confirmed one",
+        "but not alone",
+        "nor beside a tentative one",
     ],
 )
-def test_of_tracks_on_one_hand_the_surest_goes_on(
+def test_of_tracks_on_one_hand_the_surest_goes_on_and_none_that_is_doubted_for_long(
     tracks: tuple[Track, ...], left: list[int]
 ) -> None:
-    assert numbers(*tracks) == left
-
-
-def test_what_nobody_sees_ends_whether_it_was_a_hand_or_not() -> None:
-    long = Duration(1.0)
-    state = going_on(track_of(HERE, doubtful=long), track_of(THERE, doubtful=long, **NEW))
-    assert state.tracks == ()
-
-
-def test_a_tentative_track_ends_beside_a_confirmed_one_but_not_alone() -> None:
-    waiting = track_of(THERE, confirmed=False, age=Duration(0.6))
-    assert numbers(SURE, waiting) == [0] and numbers(waiting) == [0]
-    assert numbers(waiting, track_of(HERE, confirmed=False)) == [0, 1]
+    numbered = [replace(track, number=at) for at, track in enumerate(tracks)]
+    state = keep_tracks(state_of(), numbered, right_hand_model())
+    assert [track.number for track in state.tracks] == left
 
 
 def test_time_goes_on_with_the_images_and_not_where_a_clock_goes_back() -> None:

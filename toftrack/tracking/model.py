@@ -196,7 +196,7 @@ class TrackerModel(FilterModel):
     lost: ConfidenceModel
 
     def at_quality(self, quality: Quality) -> TrackerModel:
-        """See FilterModel. What is cached is shared: only the detector's settings differ."""
+        """See FilterModel. What is cached is shared, as only the detector's settings differ."""
         if quality == Quality(quality.threads):
             return self
         settings, most = self.detector.settings, quality.places
