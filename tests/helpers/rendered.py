@@ -90,7 +90,7 @@ def state_of(
 
 def scene_of(*tracks: Track, image: DepthImage, model: TrackerModel | None = None) -> Scene:
     """An image in the next frame of tracks."""
-    return Scene.of(tracks, image, FRAME_S, model or right_hand_model())
+    return Scene(tracks, image, FRAME_S, model or right_hand_model())
 
 
 def view_of(

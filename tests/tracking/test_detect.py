@@ -49,7 +49,7 @@ def looked(
     detector = changes.pop("detector", None) or FixedDetector(found)
     model = replace(any_hand_model(), detector=detector)
     state = state_of(*tracks, model=model, **changes)
-    scene = Scene.of(state.tracks, IMAGE, dt_s, model)
+    scene = Scene(state.tracks, IMAGE, dt_s, model)
     pending = start_detection(scene, state)
     return detector, finish_detection(pending, scene, state), pending
 

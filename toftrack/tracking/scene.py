@@ -35,22 +35,17 @@ Arm = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """An image, and the hands predicted in it.
+    """A frame's image, dt_s after the last frame, and the hands predicted in it."""
 
-    hands: one a track; a row is an index into them.  dt_s: since the last frame.
-    """
-
+    tracks: Sequence[Track]
     image: DepthImage
-    hands: tuple[PredictedHand, ...]
     dt_s: float
     model: TrackerModel
 
-    @classmethod
-    def of(
-        cls, tracks: Sequence[Track], image: DepthImage, dt_s: float, model: TrackerModel
-    ) -> Scene:
-        """The scene of a frame that comes dt_s after the tracks' last one."""
-        return cls(image, tuple(predict(track, dt_s, model) for track in tracks), dt_s, model)
+    @cached_property
+    def hands(self) -> tuple[PredictedHand, ...]:
+        """The predicted hand of each track; a `row` is an index into them."""
+        return tuple(predict(track, self.dt_s, self.model) for track in self.tracks)
 
     @cached_property
     def reduced(self) -> DepthImage:

@@ -54,7 +54,7 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     with spans("detector"):
         depth_m = without_flying_pixels(image.depth_m, image.k, model.detector.settings.flying)
         image = replace(image, depth_m=depth_m)
-        scene = Scene.of(state.tracks, image, dt_s, model)
+        scene = Scene(state.tracks, image, dt_s, model)
         rows = range(len(scene.hands))
         pending = start_detection(scene, state)
         resting = [rests(scene, row, state) for row in rows]
