@@ -20,8 +20,7 @@ class PoseSpace:
     """A learned low-dimensional space of hand poses (paper, section 2.3).
 
     A further kind is a subclass, whose tensors are what its model file holds, with a class method
-    `fit(angles, labels, dims, **settings)` that learns one (docs/extending.md). toftrack's own have
-    functions for that, in files.KINDS.
+    `fit(angles, labels, dims, **settings)` that learns one, if it can be (docs/extending.md).
 
     kind: the name that stands in model files; that of the class where it gives none.
     lower, upper: (d,) bounds: the extremes of the training poses in each coordinate.

@@ -21,15 +21,8 @@ from toftrack.files.json_text import parse_json
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.pose_space.base import PoseSpace
 from toftrack.pose_space.data.pose_data import PoseData, natural_data, synthetic_data
-from toftrack.pose_space.kernel import (
-    IsomapPoseSpace,
-    KernelPCAPoseSpace,
-    LLEPoseSpace,
-    fit_isomap,
-    fit_kernel_pca,
-    fit_lle,
-)
-from toftrack.pose_space.pca import PCAPoseSpace, fit_pca
+from toftrack.pose_space.kernel import IsomapPoseSpace, KernelPCAPoseSpace, LLEPoseSpace
+from toftrack.pose_space.pca import PCAPoseSpace
 
 FORMAT = "toftrack-pose-space"
 VERSION = 1
@@ -43,20 +36,14 @@ _SAME_RAD = 1e-6
 """Poses that differ by less than this in every angle are the same."""
 
 
-KINDS: dict[str, tuple[type[PoseSpace], Callable[..., PoseSpace]]] = {
-    "isomap": (IsomapPoseSpace, fit_isomap),
-    "kernel_pca": (KernelPCAPoseSpace, fit_kernel_pca),
-    "lle": (LLEPoseSpace, fit_lle),
-    "pca": (PCAPoseSpace, fit_pca),
-}
-"""Every kind of toftrack's own, and what learns one."""
+_OWN = (IsomapPoseSpace, KernelPCAPoseSpace, LLEPoseSpace, PCAPoseSpace)
+KINDS: dict[str, type[PoseSpace]] = {space.kind: space for space in _OWN}
+"""Every kind of toftrack's own."""
 
 
-def kind_of_space(
-    kind: str, of_file: str | None = None
-) -> tuple[type[PoseSpace], Callable[..., PoseSpace]]:
-    """The class of a kind and what learns one: of a name in KINDS, of an installed package's entry
-    point, or of a class that the configuration names, my_module.MySpace.
+def kind_of_space(kind: str, of_file: str | None = None) -> type[PoseSpace]:
+    """The class of a kind: of a name in KINDS, of an installed package's entry point, or one that
+    the configuration names, my_module.MySpace.
 
     of_file: the data file that names it, if one does: there a class's path is only a name.
     """
@@ -75,14 +62,7 @@ def kind_of_space(
         )
     if not (isinstance(space, type) and issubclass(space, PoseSpace)):
         raise ToftrackError(f"pose_space.kind={kind} is no subclass of PoseSpace; name one")
-    return space, getattr(space, "fit", partial(_not_learned, kind))
-
-
-def _not_learned(kind: str, angles: Any, labels: Any, dims: int) -> PoseSpace:
-    raise ToftrackError(
-        f"pose_space.kind={kind} has no class method fit, and cannot be learned; write one, or give"
-        " pose_space.file=FILE"
-    )
+    return space
 
 
 def fit_pose_space(
@@ -92,7 +72,12 @@ def fit_pose_space(
 
     settings: of that kind, as its `fit` takes them.
     """
-    fit = kind_of_space(kind)[1]
+    fit = getattr(kind_of_space(kind), "fit", None)
+    if fit is None:
+        raise ToftrackError(
+            f"pose_space.kind={kind} has no class method fit, and cannot be learned; write one, or"
+            " give pose_space.file=FILE"
+        )
     takes = tuple(inspect.signature(fit).parameters)[3:]
     unknown = [name for name in settings if name not in takes]
     if unknown:
@@ -107,7 +92,8 @@ def fit_pose_space(
         )
     # Matrices of some hundred rows: a second thread only waits for the first, four times as long.
     with threadpool_limits(1, "blas"):
-        return fit(data.angles_rad, data.labels, dims, **settings)
+        space: PoseSpace = fit(data.angles_rad, data.labels, dims, **settings)
+        return space
 
 
 def save_pose_space(
@@ -132,9 +118,9 @@ def load_pose_space(path: str | Path, configured: str = "pca") -> PoseSpace:
     """
     header, arrays = _read(path)
     kind, labels = header.get("kind"), header.get("training_labels")
-    made, _ = kind_of_space(configured)
+    made = kind_of_space(configured)
     if kind != made.kind:
-        made, _ = kind_of_space(str(kind), of_file=str(path))
+        made = kind_of_space(str(kind), of_file=str(path))
     if header.get("angle_names") != list(ANGLE_NAMES):
         raise ToftrackError(
             f"{path} describes other joint angles than the {len(ANGLE_NAMES)} of this"
@@ -199,7 +185,7 @@ def make_pose_space(
             )
         return fit_pose_space(kind, dims, _DATA[data](), **settings).to("cpu")
     space = load_pose_space(file, kind)
-    wanted = kind_of_space(kind)[0].kind
+    wanted = kind_of_space(kind).kind
     if space.kind != wanted or space.dims != dims:
         choice = "" if space.kind == wanted else f"pose_space={space.kind} "
         raise ToftrackError(

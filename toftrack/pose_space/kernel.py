@@ -10,10 +10,9 @@ goes on in a line instead of falling back to the mean pose.
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -152,59 +151,91 @@ class KernelPCAPoseSpace(KernelDecodedSpace):
         distance = (angles[:, None] - self.poses).square().sum(-1)
         return (-self.gamma * distance).exp() @ self.projection + self.shift
 
+    @classmethod
+    def fit(
+        cls, angles: Tensor, labels: tuple[str, ...], dims: int, gamma: float | None = None
+    ) -> Self:
+        """Kernel PCA of (M, 21) training poses; float32 on the CPU.
 
-def fit_kernel_pca(
-    angles: Tensor, labels: tuple[str, ...], dims: int = 4, gamma: float | None = None
-) -> KernelPCAPoseSpace:
-    """Kernel PCA of (M, 21) training poses; float32 on the CPU.
+        gamma: of the kernel between poses, 1 / rad^2; None tries several and takes the one whose
+            cross-validated map back to angles is best.
+        """
+        import sklearn.decomposition  # here, as it takes a while, and the linear space needs none
 
-    gamma: of the kernel between poses, 1 / rad^2; None tries several and takes the one whose
-        cross-validated map back to angles is best.
-    """
-    import sklearn.decomposition  # here, as it takes a while, and the linear space needs none
-
-    x = angles.double().cpu().numpy()
-    check_dims(dims, len(x), len(x) - 1)
-    if gamma is not None and gamma <= 0:
-        raise ToftrackError(f"pose_space.gamma={gamma} must be above 0, in 1 / rad^2, or null")
-    square = _squared_distances(x)
-    median = _median(square)
-    fits = []
-    for candidate in (gamma,) if gamma else [1 / (2 * w**2 * median) for w in _POSE_WIDTHS]:
-        model = sklearn.decomposition.KernelPCA(
-            n_components=dims, kernel="rbf", gamma=candidate, eigen_solver="dense"
-        ).fit(x)
-        if model.eigenvalues_.shape[0] < dims or model.eigenvalues_[-1] < 1e-10:
-            continue
-        vectors = signed(model.eigenvectors_)
-        # In this unit the coordinates are those of PCA, in radians, when the kernel is wide.
-        unit = 1 / np.sqrt(2 * candidate)
-        error_rad, found = _regression(unit * vectors * np.sqrt(model.eigenvalues_), x)
-        fits.append((error_rad, found, unit * vectors / np.sqrt(model.eigenvalues_), candidate))
-    if not fits:
-        raise ToftrackError(
-            f"pose_space.dims={dims} is more than the {len(x)} poses span; give a smaller number"
+        x = angles.double().cpu().numpy()
+        check_dims(dims, len(x), len(x) - 1)
+        if gamma is not None and gamma <= 0:
+            raise ToftrackError(f"pose_space.gamma={gamma} must be above 0, in 1 / rad^2, or null")
+        square = _squared_distances(x)
+        median = _median(square)
+        fits = []
+        for candidate in (gamma,) if gamma else [1 / (2 * w**2 * median) for w in _POSE_WIDTHS]:
+            model = sklearn.decomposition.KernelPCA(
+                n_components=dims, kernel="rbf", gamma=candidate, eigen_solver="dense"
+            ).fit(x)
+            if model.eigenvalues_.shape[0] < dims or model.eigenvalues_[-1] < 1e-10:
+                continue
+            vectors = signed(model.eigenvectors_)
+            # In this unit the coordinates are those of PCA, in radians, when the kernel is wide.
+            unit = 1 / np.sqrt(2 * candidate)
+            error_rad, found = _regression(unit * vectors * np.sqrt(model.eigenvalues_), x)
+            fits.append((error_rad, found, unit * vectors / np.sqrt(model.eigenvalues_), candidate))
+        if not fits:
+            raise ToftrackError(
+                f"pose_space.dims={dims} is more than the {len(x)} poses span; give a smaller"
+                " number"
+            )
+        _, found, projection, chosen = min(fits, key=lambda fit: fit[0])
+        # The centred kernel row is k - mean(k) - column means + grand mean; the eigenvectors of a
+        # centred kernel sum to zero, so that only the column means are left.
+        return cls(
+            **found,
+            training_labels=labels,
+            gamma=tensor32(chosen),
+            projection=tensor32(projection),
+            shift=tensor32(-np.exp(-chosen * square).mean(0) @ projection),
         )
-    _, found, projection, chosen = min(fits, key=lambda fit: fit[0])
-    # The centred kernel row is k - mean(k) - column means + grand mean; the eigenvectors of a
-    # centred kernel sum to zero, so that only the column means are left.
-    return KernelPCAPoseSpace(
-        **found,
-        training_labels=labels,
-        gamma=tensor32(chosen),
-        projection=tensor32(projection),
-        shift=tensor32(-np.exp(-chosen * square).mean(0) @ projection),
-    )
 
 
 @dataclass(frozen=True, eq=False)
 class NeighbourSpace(KernelDecodedSpace):
     """Coordinates that are known only at the training poses: a new pose asks its neighbours.
 
-    neighbours: () their number.
+    neighbours: () their number.  tried: those that are, where none is given.
     """
 
+    tried: ClassVar[tuple[int, ...]]
+
     neighbours: Tensor
+
+    @staticmethod
+    def embedded(poses: np.ndarray, dims: int, neighbours: int) -> np.ndarray:
+        """(M, 21) poses to (M, dims) coordinates, float64."""
+        raise NotImplementedError
+
+    @classmethod
+    def fit(
+        cls, angles: Tensor, labels: tuple[str, ...], dims: int, neighbours: int | None = None
+    ) -> Self:
+        """The space of (M, 21) training poses whose cross-validated map back to angles is best
+        among numbers of neighbours.
+
+        neighbours: the only number to try; None tries those that fit the poses.
+        """
+        x = angles.double().cpu().numpy()
+        most = len(x) - 1
+        check_dims(dims, len(x), min(most - 1, x.shape[1]))
+        if neighbours is not None and not dims < neighbours <= most:
+            raise ToftrackError(
+                f"pose_space.neighbours={neighbours} must be above the {dims} dimensions and at"
+                f" most {most} for {len(x)} poses, or null"
+            )
+        numbers = (neighbours,) if neighbours else {min(max(k, dims + 1), most) for k in cls.tried}
+        fits = []
+        for number in sorted(numbers):
+            fits.append((*_regression(signed(cls.embedded(x, dims, number)), x), number))
+        _, found, number = min(fits, key=lambda fit: fit[0])
+        return cls(**found, training_labels=labels, neighbours=tensor32(number))
 
     @cached_property
     def _count(self) -> int:
@@ -224,6 +255,17 @@ class LLEPoseSpace(NeighbourSpace):
     """
 
     kind: ClassVar[str] = "lle"
+    tried: ClassVar[tuple[int, ...]] = (6, 8, 12, 16, 24)
+
+    @staticmethod
+    def embedded(poses: np.ndarray, dims: int, neighbours: int) -> np.ndarray:
+        from sklearn.manifold import LocallyLinearEmbedding
+
+        latents = LocallyLinearEmbedding(
+            n_neighbors=neighbours, n_components=dims, reg=1e-3, eigen_solver="dense"
+        ).fit_transform(poses)
+        # The method gives coordinates of unit length; unit deviation does not depend on M.
+        return (latents - latents.mean(0)) / latents.std(0).clip(1e-12)
 
 
 class IsomapPoseSpace(NeighbourSpace):
@@ -232,71 +274,17 @@ class IsomapPoseSpace(NeighbourSpace):
     """
 
     kind: ClassVar[str] = "isomap"
+    tried: ClassVar[tuple[int, ...]] = (5, 8, 12, 16, 24, 32, 48)
 
+    @staticmethod
+    def embedded(poses: np.ndarray, dims: int, neighbours: int) -> np.ndarray:
+        from sklearn.manifold import Isomap
 
-def fit_lle(
-    angles: Tensor, labels: tuple[str, ...], dims: int = 4, neighbours: int | None = None
-) -> NeighbourSpace:
-    """Locally linear embedding of (M, 21) training poses; see `_fit_neighbours`."""
-    from sklearn.manifold import LocallyLinearEmbedding
-
-    def embed(x: np.ndarray, number: int) -> np.ndarray:
-        latents = LocallyLinearEmbedding(
-            n_neighbors=number, n_components=dims, reg=1e-3, eigen_solver="dense"
-        ).fit_transform(x)
-        # The method gives coordinates of unit length; unit deviation does not depend on M.
-        return (latents - latents.mean(0)) / latents.std(0).clip(1e-12)
-
-    tried = (6, 8, 12, 16, 24)
-    return _fit_neighbours(LLEPoseSpace, embed, angles, labels, dims, neighbours, tried)
-
-
-def fit_isomap(
-    angles: Tensor, labels: tuple[str, ...], dims: int = 4, neighbours: int | None = None
-) -> NeighbourSpace:
-    """Isomap of (M, 21) training poses; see `_fit_neighbours`."""
-    from sklearn.manifold import Isomap
-
-    def embed(x: np.ndarray, number: int) -> np.ndarray:
         with warnings.catch_warnings():
             # A graph in several pieces is joined at their nearest poses, which is what is wanted.
             warnings.simplefilter("ignore")
-            model = Isomap(n_neighbors=number, n_components=dims, eigen_solver="dense")
-            return model.fit_transform(x)
-
-    tried = (5, 8, 12, 16, 24, 32, 48)
-    return _fit_neighbours(IsomapPoseSpace, embed, angles, labels, dims, neighbours, tried)
-
-
-def _fit_neighbours(
-    space: type[NeighbourSpace],
-    embed: Callable[[np.ndarray, int], np.ndarray],
-    angles: Tensor,
-    labels: tuple[str, ...],
-    dims: int,
-    neighbours: int | None,
-    tried: tuple[int, ...],
-) -> NeighbourSpace:
-    """The space whose cross-validated map back to angles is best among numbers of neighbours.
-
-    embed: (M, 21) poses and a number of neighbours to (M, dims) coordinates, float64.
-    neighbours: the only number to try; None tries those that fit the poses.
-    """
-    x = angles.double().cpu().numpy()
-    most = len(x) - 1
-    check_dims(dims, len(x), min(most - 1, x.shape[1]))
-    if neighbours is not None and not dims < neighbours <= most:
-        raise ToftrackError(
-            f"pose_space.neighbours={neighbours} must be above the {dims} dimensions and at most"
-            f" {most} for {len(x)} poses, or null"
-        )
-    fits = []
-    for number in (
-        (neighbours,) if neighbours else sorted({min(max(k, dims + 1), most) for k in tried})
-    ):
-        fits.append((*_regression(signed(embed(x, number)), x), number))
-    _, found, number = min(fits, key=lambda fit: fit[0])
-    return space(**found, training_labels=labels, neighbours=tensor32(number))
+            model = Isomap(n_neighbors=neighbours, n_components=dims, eigen_solver="dense")
+            return model.fit_transform(poses)
 
 
 def barycentric_weights(angles: Tensor, poses: Tensor, neighbours: int) -> tuple[Tensor, Tensor]:

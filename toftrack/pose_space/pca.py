@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -32,21 +32,21 @@ class PCAPoseSpace(PoseSpace):
     def encode(self, angles: Tensor) -> Tensor:
         return (angles - self.mean) @ self.components.mT
 
-
-def fit_pca(angles: Tensor, labels: tuple[str, ...], dims: int = 4) -> PCAPoseSpace:
-    """Principal components of (M, 21) training poses; float32 on the CPU."""
-    check_dims(dims, len(angles), min(angles.shape))
-    x = angles.double().cpu().numpy()
-    mean = x.mean(0)
-    _, singular, rows = np.linalg.svd(x - mean, full_matrices=False)
-    components = signed(rows.T).T[:dims]
-    latents = (x - mean) @ components.T
-    return PCAPoseSpace(
-        mean=tensor32(mean),
-        components=tensor32(components),
-        explained_variance_ratio=tensor32(singular**2 / (singular**2).sum()),
-        lower=tensor32(latents.min(0)),
-        upper=tensor32(latents.max(0)),
-        training_latents=tensor32(latents),
-        training_labels=labels,
-    )
+    @classmethod
+    def fit(cls, angles: Tensor, labels: tuple[str, ...], dims: int) -> Self:
+        """Principal components of (M, 21) training poses; float32 on the CPU."""
+        check_dims(dims, len(angles), min(angles.shape))
+        x = angles.double().cpu().numpy()
+        mean = x.mean(0)
+        _, singular, rows = np.linalg.svd(x - mean, full_matrices=False)
+        components = signed(rows.T).T[:dims]
+        latents = (x - mean) @ components.T
+        return cls(
+            mean=tensor32(mean),
+            components=tensor32(components),
+            explained_variance_ratio=tensor32(singular**2 / (singular**2).sum()),
+            lower=tensor32(latents.min(0)),
+            upper=tensor32(latents.max(0)),
+            training_latents=tensor32(latents),
+            training_labels=labels,
+        )
