@@ -26,6 +26,7 @@ from toftrack.training.hands import HAND, Hands, posed_hands
 from toftrack.training.pictures import RANGE, SENSOR_TERMS, Lens, take_pictures
 from toftrack.training.scenes import Scenes
 from toftrack.training.shapes import ShapeBank, shape_bank
+from toftrack.training.skin import PRIMITIVE
 from toftrack.training.things_numba import PART, part_distance
 
 FARTHEST_M = 7.9
@@ -187,7 +188,9 @@ def plain_scenes(
 ) -> Scenes:
     """Ellipsoids and planes alone."""
     skinned, parts = torch.zeros_like(labels, dtype=torch.bool), torch.zeros(len(labels), 0, PART)
-    return Scenes(centres_m, axes_m, labels, planes, skinned, (), parts)
+    n = len(labels)
+    skins = torch.zeros(n, 0, 1, PRIMITIVE), torch.zeros(n, 0, 1), torch.zeros(n, 0, 2)
+    return Scenes(centres_m, axes_m, labels, planes, skinned, *skins, parts)
 
 
 def channels(read_m: np.ndarray, inside: np.ndarray, distance_m: np.ndarray) -> np.ndarray:

@@ -16,10 +16,9 @@ from helpers.detection import (
     small_bank,
 )
 
-from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.training import hands as module
-from toftrack.training.hands import HAND, THING, Grasps, posed_hands, random_grasps
+from toftrack.training.hands import HAND, THING, posed_hands, random_grasps
 from toftrack.training.held_things import _PHONE_M
 from toftrack.training.things_numba import BALL, BOX, CONE, RING
 
@@ -28,11 +27,19 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 N = 300
 
 
-def grasps(seed: int = 0) -> tuple[Grasps, HandShape]:
+def grasps(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, np.ndarray]:
+    """Poses (N, 21) and joints (N, 21, 3) of those hands that hold something, and what they hold
+    (N, Q, PART).
+    """
     bank = small_bank()
     rows = dice(seed).rows(len(bank.log_size), N)
     shape, surface = bank.rows(rows)
-    return random_grasps(shape, surface, bank.log_size[rows].exp(), dice(seed)), shape
+    angles, parts = random_grasps(shape, surface, bank.log_size[rows].exp(), dice(seed))
+    joints = forward_kinematics(torch.cat((torch.zeros(N, 6), angles), 1), shape).joints_m
+    held = parts[:, 0, 0] >= 0
+    assert 0.6 < float(held.float().mean()) < 1
+    assert (parts[~held][..., 0] == -1).all(), "the others are bare"
+    return angles[held], joints[held].numpy(), parts[held].numpy()
 
 
 def distances(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
@@ -42,18 +49,15 @@ def distances(parts: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def test_most_hands_hold_something_and_their_fingers_are_at_it() -> None:
-    held, shape = grasps()
-    assert float(held.held.float().mean()) > 0.6
+    angles, joints, things = grasps()
     low, high = torch.tensor(ANGLE_LIMITS).unbind(1)
-    assert (held.angles >= low).all() and (held.angles <= high).all()
-    state = torch.cat((torch.zeros(N, 6), held.angles), 1)
-    joints = forward_kinematics(state, shape).joints_m.numpy()
+    assert (angles >= low).all() and (angles <= high).all()
     nearest, deepest = [], []
-    for row in torch.nonzero(held.held)[:, 0].tolist():
+    for hand, parts in zip(joints, things, strict=True):
         # The bones' middles and the joints of each finger.
-        chain = joints[row, 1:].reshape(5, 4, 3)
+        chain = hand[1:].reshape(5, 4, 3)
         middles = (chain[:, 1:] + chain[:, :-1]) / 2
-        away = distances(held.parts[row].numpy(), middles.reshape(-1, 3)).reshape(5, 3)
+        away = distances(parts, middles.reshape(-1, 3)).reshape(5, 3)
         nearest.append(np.sort(away.min(1))[1])
         deepest.append(away.min())
     # A bone lies some 8 mm below the skin that touches; some hands are just letting go.
@@ -63,53 +67,41 @@ def test_most_hands_hold_something_and_their_fingers_are_at_it() -> None:
 
 def in_palm(
     opposed: float, tries: int, monkeypatch: pytest.MonkeyPatch
-) -> tuple[Grasps, np.ndarray]:
-    """Power grasps, and their joints (N, 21, 3)."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Joints of power grasps and their things, see grasps."""
     monkeypatch.setattr(module, "POWER_SHARE", 1.0)
     monkeypatch.setattr(module, "_OPENED_SHARE", 0.0)
     monkeypatch.setattr(module, "_OPPOSED_SHARE", opposed)
     monkeypatch.setattr(module, "_THUMB_TRIES", tries)
-    held, shape = grasps()
-    state = torch.cat((torch.zeros(N, 6), held.angles), 1)
-    return held, forward_kinematics(state, shape).joints_m.numpy()
+    return grasps()[1:]
 
 
 def test_thumbs_try_until_their_pads_touch_what_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     touching = []
     at = np.array([[0.3], [0.6], [0.9]])
     for tries in (1, 10):
-        held, joints = in_palm(0.0, tries, monkeypatch)
-        rows = torch.nonzero(held.held)[:, 0].tolist()
         ends = [
-            distances(held.parts[r].numpy(), joints[r, 3] + at * (joints[r, 4] - joints[r, 3]))
-            for r in rows
+            distances(parts, hand[3] + at * (hand[4] - hand[3]))
+            for hand, parts in zip(*in_palm(0.0, tries, monkeypatch), strict=True)
         ]
         touching.append(np.mean([end.min() < 0.013 for end in ends]))
     assert touching[1] > touching[0] + 0.05
 
 
 def test_thumbs_about_a_thing_do_not_go_through_fingers(monkeypatch: pytest.MonkeyPatch) -> None:
-    held, joints = in_palm(0.75, 10, monkeypatch)
+    joints, _ = in_palm(0.75, 10, monkeypatch)
     along = np.linspace(0, 1, 9)[:, None]
-    chains = joints[held.held.numpy(), 1:].reshape(-1, 5, 4, 3)
+    chains = joints[:, 1:].reshape(-1, 5, 4, 3)
     lines = chains[:, :, :-1, None] + along * (chains[:, :, 1:] - chains[:, :, :-1])[:, :, :, None]
     thumb, fingers = lines[:, 0, 1:].reshape(-1, 18, 3), lines[:, 1:4].reshape(-1, 81, 3)
     nearest = np.linalg.norm(thumb[:, :, None] - fingers[:, None], axis=-1).min((1, 2))
     assert np.mean(nearest > 0.008) > 0.95
 
 
-def test_a_hand_that_could_not_hold_its_thing_is_bare() -> None:
-    held, _ = grasps()
-    assert not held.held.all()
-    assert (held.parts[~held.held, :, 0] == -1).all()
-    assert (held.parts[held.held, 0, 0] >= 0).all()
-
-
 def test_no_thing_could_be_a_phone() -> None:
     for seed in range(3):
-        held, _ = grasps(seed)
-        boxes = held.parts[(held.parts[..., 0] == BOX)]
-        thin, wide, long = (2 * boxes[:, 13:16]).sort(1).values.unbind(1)
+        _, _, parts = grasps(seed)
+        thin, wide, long = np.sort(2 * parts[parts[..., 0] == BOX][:, 13:16], 1).T
         (w0, w1), (l0, l1), (_, t1) = _PHONE_M
         phones = (w0 < wide) & (wide < w1) & (l0 < long) & (long < l1) & (thin < t1)
         assert not phones.any()

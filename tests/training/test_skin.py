@@ -41,9 +41,14 @@ def scenes(posed: Hands, blend_m: float | None = None) -> Scenes:
     if blend_m is None:
         return plain
     covered = posed.labels == HAND
-    zero = torch.zeros(N)
-    skins = replace(posed.skins, covered=covered, blend_m=zero + blend_m, outside_m=zero)
-    return replace(plain, skinned=covered, skins=((skins, skins.labels(labels)),))
+    skins = replace(posed.skins, covered=covered)
+    return replace(
+        plain,
+        skinned=covered,
+        skins=skins.primitives[:, None],
+        skin_labels=skins.labels(labels)[:, None],
+        skin_widths_m=torch.tensor([blend_m, 0.0]).expand(N, 1, 2),
+    )
 
 
 def pictures(scene: Scenes) -> np.ndarray:

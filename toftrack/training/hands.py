@@ -222,8 +222,7 @@ def _holding(
     parts = torch.zeros(n, PARTS_OF_A_THING, PART)
     parts[..., 0] = -1
     if len(some) > 0:
-        held = random_grasps(shape, surface, size[some], dice)
-        angles[some], parts[some] = held.angles, held.parts
+        angles[some], parts[some] = random_grasps(shape, surface, size[some], dice)
     return angles, parts
 
 
@@ -294,21 +293,14 @@ _OPPOSED_SHARE = 0.5
 _DEEPEST_M = 0.004
 
 
-@dataclass(frozen=True, eq=False)
-class Grasps:
-    """N hands with things in the frame of a right hand whose wrist is the origin.
+def random_grasps(
+    shape: HandShape, surface: HandSurface, size: Tensor, dice: Dice
+) -> tuple[Tensor, Tensor]:
+    """A grasp for each of N right hands, see ShapeBank.rows: the poses (N, 21), and the things that
+    the fingers touch (N, Q, PART), in the frames of the hands; where that failed there is none.
 
-    angles: (N, 21).  parts: (N, Q, PART) of the things.  held: (N,) the fingers touch the thing; a
-    hand for which that failed is bare.
+    size: (N,) in mean adult's hands.
     """
-
-    angles: Tensor
-    parts: Tensor
-    held: Tensor
-
-
-def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Dice) -> Grasps:
-    """A grasp for each of N right hands, see ShapeBank.rows; size: (N,) in mean adult's hands."""
     n = len(size)
     power = dice.chance(POWER_SHARE, n)
     radii, shifts = _capsules(surface)
@@ -348,7 +340,7 @@ def random_grasps(shape: HandShape, surface: HandSurface, size: Tensor, dice: Di
     opened[:, 5:] = torch.minimum(opened[:, 5:], angles[:, 5:])
     angles = torch.lerp(angles, opened, away)
     parts[..., 0] = torch.where(held[:, None], parts[..., 0], -1.0)
-    return Grasps(clamp_to_joint_limits(angles), parts, held)
+    return clamp_to_joint_limits(angles), parts
 
 
 def _doubles(tensor: Tensor):

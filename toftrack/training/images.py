@@ -347,17 +347,17 @@ def random_scenes(
     plain = torch.zeros(n, all_labels.shape[1] - covered.shape[1], dtype=torch.bool)
     parts = second.parts.clone()
     parts[..., 0] = torch.where(there[:, None], parts[..., 0], -1.0)
-    skins = tuple(
-        (one.skins, one.skins.labels(each))
-        for one, each in ((hands, labels), (second, other_labels))
-    )
+    skins = hands.skins, second.skins
+    widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin in skins]
     return Scenes(
         torch.cat(centres, 1),
         torch.cat(axes, 1),
         all_labels,
         planes,
         torch.cat((covered, plain), 1),
-        skins,
+        torch.stack([skin.primitives for skin in skins], 1),
+        torch.stack((skins[0].labels(labels), skins[1].labels(other_labels)), 1),
+        torch.stack(widths, 1),
         torch.cat((hands.parts, parts), 1),
     )
 

@@ -21,7 +21,6 @@ from toftrack.detector.network import PARTS
 from toftrack.training.dice import Dice
 from toftrack.training.hands import FOREARM, THING
 from toftrack.training.scenes import Scenes
-from toftrack.training.skin import PRIMITIVE
 from toftrack.training.skin_numba import draw_skin
 from toftrack.training.things_numba import TILE, draw_part
 
@@ -94,13 +93,13 @@ def take_pictures(
     depth = np.zeros((n, *size), np.float32)
     labels = np.full((n, *size), -1, np.int8)
     seeds = torch.randint(1, 2**31 - 1, (n,), generator=dice.generator)
-    which = torch.where(scenes.skinned, -1, scenes.labels).to(torch.int8)
+    which = torch.where(scenes.skinned, -1, scenes.labels)
     axes = scenes.axes_m
     ellipsoids = (_plain(scenes.centres_m), _plain(axes), _plain(torch.linalg.inv(axes)))
     lenses = torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)
     _take(
-        (*ellipsoids, which.numpy()),
-        _skins(scenes),
+        (*ellipsoids, _integers(which)),
+        (_plain(scenes.skins), _integers(scenes.skin_labels), _plain(scenes.skin_widths_m)),
         (_plain(scenes.planes), _plain(scenes.parts)),
         (_plain(lenses), _plain(sensors), seeds.numpy().astype(np.uint32)),
         depth,
@@ -109,24 +108,12 @@ def take_pictures(
     return depth, labels
 
 
-def _skins(scenes: Scenes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of S hands' skins, (N, S, K, PRIMITIVE) primitives, (N, S, K) int8 labels, and (N, S, 2) how
-    far a skin blends and lies outside.
-    """
-    n, skins = len(scenes.labels), scenes.skins
-    if not skins:
-        none = np.zeros((n, 0, 1, PRIMITIVE), np.float32), np.zeros((n, 0, 1), np.int8)
-        return *none, np.zeros((n, 0, 2), np.float32)
-    widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin, _ in skins]
-    return (
-        _plain(torch.stack([skin.primitives for skin, _ in skins], 1)),
-        torch.stack([labels for _, labels in skins], 1).to(torch.int8).numpy(),
-        _plain(torch.stack(widths, 1)),
-    )
-
-
 def _plain(tensor: Tensor) -> np.ndarray:
     return tensor.float().contiguous().numpy()
+
+
+def _integers(tensor: Tensor) -> np.ndarray:
+    return tensor.to(torch.int8).numpy()
 
 
 @compiled

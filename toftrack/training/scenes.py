@@ -14,7 +14,6 @@ from torch import Tensor
 
 from toftrack.training.dice import Dice
 from toftrack.training.hands import ABOVE, BACKGROUND, FRONT, HEAD, THING, Hands, turn
-from toftrack.training.skin import Skins
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,7 +23,8 @@ class Scenes:
     centres_m, axes_m: (N, M, 3), (N, M, 3, 3) ellipsoids.  labels: (N, M), -1 = there is none.
     planes: (N, P, 4): points X with n.X = d, as (n, d); d = inf is none.
     skinned: (N, M) ellipsoids that a skin is drawn instead of.
-    skins: of some hands, each with the labels (N, P) of its primitives.
+    skins: (N, S, K, PRIMITIVE) of S hands, see skin.Skins.  skin_labels: (N, S, K) of their
+        primitives, -1 = none.  skin_widths_m: (N, S, 2) how far each blends and lies outside.
     parts: (N, Q, PART) of things, see things_numba.
     """
 
@@ -33,7 +33,9 @@ class Scenes:
     labels: Tensor
     planes: Tensor
     skinned: Tensor
-    skins: tuple[tuple[Skins, Tensor], ...]
+    skins: Tensor
+    skin_labels: Tensor
+    skin_widths_m: Tensor
     parts: Tensor
 
 
@@ -41,15 +43,11 @@ def moved(scenes: Scenes, by_m: Tensor) -> Scenes:
     """The same scenes elsewhere; by_m: (N, 3)."""
     planes = scenes.planes.clone()
     planes[..., 3] += (planes[..., :3] * by_m[:, None]).sum(-1)
-    parts = scenes.parts.clone()
+    parts, skins = scenes.parts.clone(), scenes.skins.clone()
     parts[..., 1:4] += by_m[:, None]
-    return replace(
-        scenes,
-        centres_m=scenes.centres_m + by_m[:, None],
-        planes=planes,
-        skins=tuple((skin.moved(by_m), labels) for skin, labels in scenes.skins),
-        parts=parts,
-    )
+    skins[..., :3] += by_m[:, None, None]
+    centres = scenes.centres_m + by_m[:, None]
+    return replace(scenes, centres_m=centres, planes=planes, skins=skins, parts=parts)
 
 
 def surroundings(hands: Hands, dice: Dice, views: Tensor) -> tuple[Tensor, Tensor, Tensor]:

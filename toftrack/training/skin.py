@@ -8,7 +8,7 @@ tips are differs from hand to hand; a quarter of the hands keeps the ellipsoids 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -52,12 +52,6 @@ class Skins:
         """(N, P) of the primitives, -1 = not drawn, from those of the hand's ellipsoids (N, E)."""
         drawn = self.used & self.covered[:, self.source]
         return torch.where(drawn, labels[:, self.source], -1)
-
-    def moved(self, by_m: Tensor) -> Skins:
-        """The same elsewhere; by_m: (N, 3)."""
-        primitives = self.primitives.clone()
-        primitives[..., :3] += by_m[:, None]
-        return replace(self, primitives=primitives)
 
 
 def random_skins(
