@@ -54,36 +54,28 @@ _SOFT = 0.05
 """Width of the kink of the quantile's loss, log scale."""
 
 
-class JointRows(NamedTuple):
-    """What T estimates said of their joints, and how it was.
-
-    features: (T, 21, S).  error_cm: (T, 21, 3) along joint_axes.
-    near: (T, 21) the hand is there, and the joint within 40 mm.
-    counted: (T,) the hand is there and the estimate not flagged lost.
-    """
-
-    features: np.ndarray
-    error_cm: np.ndarray
-    near: np.ndarray
-    counted: np.ndarray
-
-    def of(self, rows: np.ndarray) -> JointRows:
-        """Some of them."""
-        return JointRows(*(values[rows] for values in self))
-
-
 class Observed(NamedTuple):
     """What the tracker's estimates of T frames were formed from, and how right they were.
 
     features: (T, S).  right: (T,) every joint is within 40 mm.  whole: (T,) they are on average.
-    joints: of each joint.  sequence: (T,) numbers of the sequences.
+    joint_features: (T, 21, S) of each joint.  error_cm: (T, 21, 3) along joint_axes.
+    near: (T, 21) the hand is there, and the joint within 40 mm.
+    counted: (T,) the hand is there and the estimate not flagged lost.
+    sequence: (T,) numbers of the sequences.
     """
 
     features: np.ndarray
     right: np.ndarray
     whole: np.ndarray
-    joints: JointRows
+    joint_features: np.ndarray
+    error_cm: np.ndarray
+    near: np.ndarray
+    counted: np.ndarray
     sequence: np.ndarray
+
+    def of(self, rows: np.ndarray) -> Observed:
+        """Some of them."""
+        return Observed(*(values[rows] for values in self))
 
 
 def fit_confidence(asked: argparse.Namespace) -> None:
@@ -101,7 +93,8 @@ def fit_confidence(asked: argparse.Namespace) -> None:
         )
         for number in numbers
     ]
-    seen = _together([part for part in parts if part is not None])
+    found = [part for part in parts if part is not None]
+    seen = Observed(*map(np.concatenate, zip(*found, strict=True)))
     kept = seen.sequence % _HELD_OUT == 0
     log_odds, summary = _fitted_frames(seen, seen.right, kept)
     summary["whole"] = _fitted_frames(seen, seen.whole, kept)[1]
@@ -166,16 +159,16 @@ def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:
     for row in range(1, len(smooth)):
         if not begins[row] and seen.sequence[row] == seen.sequence[row - 1]:
             smooth[row] = memory * smooth[row - 1] + (1 - memory) * log_odds[row]
-    features = seen.joints.features.copy()
+    features = seen.joint_features.copy()
     features[..., JOINT_FEATURES.index("doubt")] = np.logaddexp(0, -smooth)[:, None]
-    return seen._replace(joints=seen.joints._replace(features=features))
+    return seen._replace(joint_features=features)
 
 
 def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[JointConfidence, dict[str, Any]]:
     """What was fitted, and figures about joints in kept frames."""
-    belief = fitted_joint_belief(seen.joints.of(~kept))
-    check = seen.joints.of(kept)
-    reported = [belief.judge(features) for features in check.features]
+    belief = fitted_joint_belief(seen.of(~kept))
+    check = seen.of(kept)
+    reported = [belief.judge(features) for features in check.joint_features]
     sigma, near = np.stack([one[0] for one in reported]), np.stack([one[1] for one in reported])
     off = np.sqrt(np.square(check.error_cm / (100 * sigma)).sum(2))[check.counted]
     right = np.where(check.near, near, 1 - near)
@@ -188,22 +181,22 @@ def _fitted_joints(seen: Observed, kept: np.ndarray) -> tuple[JointConfidence, d
     return belief, summary
 
 
-def fitted_joint_belief(rows: JointRows) -> JointConfidence:
-    """The confidence that suits the rows best.
+def fitted_joint_belief(seen: Observed) -> JointConfidence:
+    """The confidence that suits the frames best.
 
     Standard deviations are those of Student's t, which says how errors differ; then all three of a
     joint are changed alike, so that the 90 % regions hold what they should under any features.
     Features only ever make a joint less sure: those that go together would otherwise get weights of
     both kinds, which hold for rendered hands only.
     """
-    used = rows.of(rows.counted)
-    design, unit = _design(used.features)
+    used = seen.of(seen.counted)
+    design, unit = _design(used.joint_features)
     error = used.error_cm.reshape(-1, 3)
     sigma = _fit_spread(design, error)
     off = np.sqrt(np.square(error * np.exp(-design @ sigma)).sum(1))
     sigma += _fit_quantile(design, np.log(np.maximum(off, 1e-3) / REGION_90), sigma.min(1))[:, None]
-    every, every_unit = _design(rows.features)
-    odds = _fit_odds(every, rows.near.reshape(-1))
+    every, every_unit = _design(seen.joint_features)
+    odds = _fit_odds(every, seen.near.reshape(-1))
     table = np.column_stack((_plain(sigma, unit), _plain(odds[:, None], every_unit)))
     lines = [[round(float(value), 3) + 0.0 for value in row] for row in table]
     return JointConfidence(
@@ -329,18 +322,8 @@ def observed(sequence: Sequence, overrides: list[str], seed: int, number: int) -
         error_cm = 100 * np.einsum("jab,jb->ja", joint_axes(joints), off)
         counted = there and not estimate.lost
         of_joints = (info.joint_features, error_cm, near, counted)
-        rows.append((info.features.values(), near.all(), whole, *of_joints))
-    if not rows:
-        return None
-    features, right, whole, *joint_rows = map(np.array, zip(*rows, strict=True))
-    return Observed(features, right, whole, JointRows(*joint_rows), np.full(len(rows), number))
-
-
-def _together(parts: list[Observed]) -> Observed:
-    features, right, whole, joints, sequence = zip(*parts, strict=True)
-    joined = JointRows(*map(np.concatenate, zip(*joints, strict=True)))
-    one, two, three, four = map(np.concatenate, (features, right, whole, sequence))
-    return Observed(one, two, three, joined, four)
+        rows.append((info.features.values(), near.all(), whole, *of_joints, number))
+    return Observed(*map(np.array, zip(*rows, strict=True))) if rows else None
 
 
 _BINS = 10
