@@ -103,18 +103,6 @@ class HandSurface:
     centres_m: Tensor
     axes_m: Tensor
 
-    def __len__(self) -> int:
-        """The number of ellipsoids of the hand, the wrist's not counted."""
-        return len(self.frame_index) - 1
-
-    def to(self, *args: object, **kwargs: object) -> HandSurface:
-        """The same surface on another device or of another floating dtype, as `torch.Tensor.to`."""
-        return HandSurface(
-            self.frame_index.to(self.centres_m.to(*args, **kwargs).device),
-            self.centres_m.to(*args, **kwargs),
-            self.axes_m.to(*args, **kwargs),
-        )
-
     def pose(self, pose: HandPose) -> Ellipsoids:
         """Ellipsoids of N posed hands, the wrist's last: (N, E + 1)."""
         frames = pose.frames[:, self.frame_index]

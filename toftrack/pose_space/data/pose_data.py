@@ -85,12 +85,6 @@ def drawn_poses() -> Tensor:
     return _kept("space_rad")
 
 
-@functools.cache
-def natural_poses() -> Tensor:
-    """(1600, 21) radians: the recorded poses and as many that were drawn."""
-    return torch.cat((recorded_poses(), _kept("sampled_rad")))
-
-
 CLIP = 80
 """Natural poses in a row that are held out together."""
 
