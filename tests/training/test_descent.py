@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +26,13 @@ from toftrack.errors import ToftrackError
 from toftrack.training import batches, checkpoints, descent, images
 from toftrack.training.batches import Batches
 from toftrack.training.checkpoints import Checkpoints, Progress
-from toftrack.training.descent import Schedule, train_finder, train_poses
+from toftrack.training.descent import Schedule, train_network
 from toftrack.training.shapes import ShapeBank
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
+train_poses, train_finder = partial(train_network, PoseNet), partial(train_network, Finder)
 
 
 @pytest.fixture

@@ -98,64 +98,43 @@ Course = list[dict[str, Any]]
 """How training went: a row every few thousand images, with running means of the errors."""
 
 
-def train_poses(
+def train_network(
+    kind: type[Network],
     schedule: Schedule,
     shapes: int,
     seed: int,
     checkpoints: Checkpoints | None = None,
     device: torch.device = _CPU,
-) -> tuple[PoseNet, Course]:
-    """Train the pose network on a device; returns the average of its weights, on the CPU, and the
-    course.
+) -> tuple[Network, Course]:
+    """Train a network on a device; returns the average of its weights, on the CPU, and the course.
 
-    On a CUDA device each step is a replay of the first one.
+    On a CUDA device each step of the pose network is a replay of the first one.
     """
+    keep_memory()
     torch.manual_seed(seed)
-    network = PoseNet(schedule.width)
-
-    def losses(crops: Crops) -> tuple[Tensor, dict[str, Tensor]]:
-        image = _image(crops.image, device)
-        with _mixed_precision(device, cache_enabled=False):
-            outputs = network.features(image)
-        return pose_losses(network.decode(image, *outputs), crops, network.anchors)
-
-    task = Task("poses", crop_images, losses, replayed=device.type != "cpu")
-    return _train(network, task, schedule, shapes, seed, checkpoints, device)
-
-
-def train_finder(
-    schedule: Schedule,
-    shapes: int,
-    seed: int,
-    checkpoints: Checkpoints | None = None,
-    device: torch.device = _CPU,
-) -> tuple[Finder, Course]:
-    """Train the finder on a device; returns the average of its weights, on the CPU, and the
-    course.
-    """
-    torch.manual_seed(seed)
-    network = Finder(schedule.width)
-
-    def losses(images: WideImages) -> tuple[Tensor, dict[str, Tensor]]:
-        image = _image(images.image, device)
-        with _mixed_precision(device):
-            found = network(image)
-        loss = finder_loss(found, images)
-        return loss, {"loss": loss.detach()}
-
-    task = Task("finder", wide_images, losses)
-    return _train(network, task, schedule, shapes, seed + 1, checkpoints, device)
-
-
-def _mixed_precision(device: torch.device, cache_enabled: bool = True) -> torch.autocast:
-    """In it, networks compute in bfloat16 where that is fast."""
-    half = half_precision(device) is torch.bfloat16
-    return torch.autocast(device.type, torch.bfloat16, half, cache_enabled)
-
-
-def _image(image: Tensor, device: torch.device) -> Tensor:
-    """A batch's images as a network takes them."""
-    return on_device(image, device).to(torch.float32, memory_format=torch.channels_last)
+    network = kind(schedule.width)
+    task = _task(network, device)
+    start = None
+    if schedule.start is not None:
+        name = "pose" if kind is PoseNet else "finder"
+        start = go_on_from(schedule.start, name, network, schedule.width)
+    seed = seed + 1 if kind is Finder else seed
+    where = (shapes, checkpoints, device)
+    course = _descend(network, task, schedule, seed, start, *where)
+    if schedule.restart_images > 0 and schedule.images > 0:
+        before, first = course[-1], deepcopy(network)
+        restart = replace(
+            schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
+        )
+        task = replace(task, name=f"{task.name}_restart")
+        begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
+        seed += _RESTART_SEED
+        for row in _descend(network, task, restart, seed, begun, *where):
+            images = before["images"] + row["images"]
+            seconds = round(before["seconds"] + row["seconds"], 1)
+            course.append(row | {"images": images, "seconds": seconds})
+        _average(network, first, torch.tensor(_RESTART_SHARE, device=device))
+    return network.cpu(), course
 
 
 @dataclass(frozen=True)
@@ -171,6 +150,33 @@ class Task:
     make: Callable[..., Any]
     losses: Callable[[Any], tuple[Tensor, dict[str, Tensor]]]
     replayed: bool = False
+
+
+def _task(network: PoseNet | Finder, device: torch.device) -> Task:
+    # Networks compute in bfloat16 where that is fast.
+    half = half_precision(device) is torch.bfloat16
+
+    def shown(image: Tensor) -> Tensor:
+        return on_device(image, device).to(torch.float32, memory_format=torch.channels_last)
+
+    if isinstance(network, Finder):
+
+        def of_images(images: WideImages) -> tuple[Tensor, dict[str, Tensor]]:
+            image = shown(images.image)
+            with torch.autocast(device.type, torch.bfloat16, half):
+                found = network(image)
+            loss = finder_loss(found, images)
+            return loss, {"loss": loss.detach()}
+
+        return Task("finder", wide_images, of_images)
+
+    def of_crops(crops: Crops) -> tuple[Tensor, dict[str, Tensor]]:
+        image = shown(crops.image)
+        with torch.autocast(device.type, torch.bfloat16, half, cache_enabled=False):
+            outputs = network.features(image)
+        return pose_losses(network.decode(image, *outputs), crops, network.anchors)
+
+    return Task("poses", crop_images, of_crops, replayed=device.type != "cpu")
 
 
 class _Step:
@@ -221,38 +227,6 @@ class _Step:
         self._graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(self._graph, capture_error_mode="thread_local"):
             self._reported = self._eager(self._batch)
-
-
-def _train(
-    network: Network,
-    task: Task,
-    schedule: Schedule,
-    shapes: int,
-    seed: int,
-    checkpoints: Checkpoints | None,
-    device: torch.device,
-) -> tuple[Network, Course]:
-    keep_memory()
-    start = None
-    if schedule.start is not None:
-        kind = "pose" if isinstance(network, PoseNet) else "finder"
-        start = go_on_from(schedule.start, kind, network, schedule.width)
-    where = (shapes, checkpoints, device)
-    course = _descend(network, task, schedule, seed, start, *where)
-    if schedule.restart_images > 0 and schedule.images > 0:
-        before, first = course[-1], deepcopy(network)
-        restart = replace(
-            schedule, images=schedule.restart_images, rate=schedule.restart_rate, restart_images=0
-        )
-        task = replace(task, name=f"{task.name}_restart")
-        begun = checksum({k: v.cpu().numpy() for k, v in network.state_dict().items()})
-        seed += _RESTART_SEED
-        for row in _descend(network, task, restart, seed, begun, *where):
-            images = before["images"] + row["images"]
-            seconds = round(before["seconds"] + row["seconds"], 1)
-            course.append(row | {"images": images, "seconds": seconds})
-        _average(network, first, torch.tensor(_RESTART_SHARE, device=device))
-    return network.cpu(), course
 
 
 def _descend(

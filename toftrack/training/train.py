@@ -39,10 +39,11 @@ def train(config: DictConfig) -> float:
     import torch
 
     from toftrack.api import compute_device
+    from toftrack.detector.network import Finder, PoseNet
     from toftrack.detector.onnx_networks import COMMAND
     from toftrack.detector.weights import load_weights, save_weights
     from toftrack.training.checkpoints import Checkpoints
-    from toftrack.training.descent import train_finder, train_poses
+    from toftrack.training.descent import train_network
     from toftrack.training.figures import course_figure, images_figure
     from toftrack.training.onnx_export import export_networks, missing_packages, needed
 
@@ -72,8 +73,8 @@ def train(config: DictConfig) -> float:
     checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
     write_picture(folder / "images.png", images_figure(config.seed))
     each = (config.shapes, config.seed, checkpoints, device)
-    finder_network, finder_course = train_finder(finder, *each)
-    pose_network, pose_course = train_poses(poses, *each)
+    finder_network, finder_course = train_network(Finder, finder, *each)
+    pose_network, pose_course = train_network(PoseNet, poses, *each)
     courses = [course for course in (finder_course, pose_course) if course]
     minutes = round(sum(course[-1]["seconds"] for course in courses) / 60, 1)
     about = {
