@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import os
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -46,23 +49,49 @@ def test_turning_leaves_the_middle_of_the_hand_where_it_is(motions) -> None:
     torch.testing.assert_close(middle(found), middle(reference), atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-8, 1e-4, 0.1, 1.0, 3.0])
-def test_compiled_motions_agree_with_the_reference(size: float) -> None:
-    moved, tangent = particles(50, size, 4), particles(50, 0.1, 5)
-    compiled, reference = rigid_numba.MOTIONS, rigid.MOTIONS
-    pairs = (
-        (compiled.compose(moved, tangent), reference.compose(moved, tangent)),
-        (compiled.compose(moved[:1], tangent), reference.compose(moved[:1], tangent)),
-        (compiled.difference(moved, moved[:1]), reference.difference(moved, moved[:1])),
-    )
-    for found, expected in pairs:
-        assert found.dtype == torch.float32
+def compared(motions: rigid.Motions, device: str = "cpu") -> None:
+    """Raises AssertionError where motions on a device are not the reference's."""
+
+    def check(found: Tensor, expected: Tensor) -> None:
+        assert found.dtype == torch.float32 and found.device.type == device
+        found = found.cpu()
         assert (found[:, 3:6].norm(dim=1) < math.pi + 1e-5).all()
-        torch.testing.assert_close(found[:, :3], expected[:, :3], atol=1e-5, rtol=1e-5)
-        torch.testing.assert_close(found[:, 6:], expected[:, 6:])
         # Rotation vectors of length pi have two signs: compare what they do.
-        rotations = (roma.rotvec_to_rotmat(rows[:, 3:6]) for rows in (found, expected))
-        torch.testing.assert_close(*rotations, atol=1e-5, rtol=0)
+        rotations = (roma.rotvec_to_rotmat(rows[:, 3:6].double()) for rows in (found, expected))
+        torch.testing.assert_close(*rotations, atol=5e-6, rtol=0)
+        for part in (slice(0, 3), slice(6, None)):
+            torch.testing.assert_close(found[:, part], expected[:, part], atol=5e-6, rtol=1e-5)
+
+    for size in (0.0, 1e-8, 1e-4, 0.1, 1.0, 3.0):
+        for many in ((70, 70), (1, 70), (70, 1)) if size == 0.1 else ((70, 70),):
+            moved, tangent = particles(many[0], size, 4), particles(many[1], max(size, 0.1), 5)
+            there = moved.to(device), tangent.to(device)
+            check(motions.compose(*there), rigid.compose(moved, tangent))
+            found = motions.difference(there[0], there[1][:1])
+            check(found, rigid.difference(moved, tangent[:1]))
+
+
+def test_compiled_motions_agree_with_the_reference() -> None:
+    compared(rigid_numba.MOTIONS)
+
+
+def test_triton_moves_particles_as_torch_does_as_far_as_its_interpreter_goes() -> None:
+    pytest.importorskip("triton", reason="triton is not installed")
+    code = "from compute.test_rigid import *; from toftrack.compute import rigid_triton\n"
+    code += "compared(rigid_triton.MOTIONS)"
+    env = {**os.environ, "TRITON_INTERPRET": "1"}
+    run = subprocess.run(
+        [sys.executable, "-c", code], env=env, capture_output=True, text=True, cwd="tests"
+    )
+    assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
+def test_cuda_moves_particles_as_torch_does() -> None:
+    from toftrack.compute import rigid_triton
+
+    compared(rigid_triton.MOTIONS, "cuda")
 
 
 def test_no_particles_and_those_that_are_no_numbers() -> None:
