@@ -8,6 +8,7 @@ from torch import Tensor
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.render.model_image import parted
 
 SHAPE = default_hand_shape().to(torch.float64)
 SURFACE = hand_surface(SHAPE)
@@ -44,8 +45,7 @@ def test_the_last_ellipsoid_of_every_finger_ends_at_its_tip() -> None:
 def test_bones_lie_within_the_flesh_however_the_fingers_bend() -> None:
     """No gap opens at a joint, though only the first has an ellipsoid of its own."""
     pose = forward_kinematics(bent_hands(200), SHAPE)
-    both = SURFACE.pose(pose)
-    flesh = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    flesh, _ = parted(SURFACE.pose(pose))
     ends = pose.joints_m[:, 1:].unflatten(1, (5, 4))
     for part in (0.0, 0.25, 0.5, 0.75):
         points = ends[:, :, :-1] + part * ends.diff(dim=2)
@@ -70,8 +70,7 @@ def test_both_hands_have_the_same_flesh() -> None:
 def test_a_palm_is_as_thick_and_a_finger_as_broad_as_people_have_them() -> None:
     """Garrett, "The adult human hand", Human Factors 13(2), 1971: 28 mm, index finger 18 to 21."""
     middle = forward_kinematics(torch.zeros(1, 27, dtype=torch.float64), SHAPE)
-    both = SURFACE.pose(middle)
-    flesh = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    flesh, _ = parted(SURFACE.pose(middle))
     z = torch.linspace(-0.05, 0.05, 401, dtype=torch.float64)
     column = torch.stack((0 * z, torch.full_like(z, -0.055), z), 1)[None]
     thick = 0.1 * float((depth_inside(column, flesh) < 1).double().mean())

@@ -80,8 +80,7 @@ def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False)
 
 def alone(hands: Hands) -> Scenes:
     """Hands and nothing else."""
-    planes = torch.tensor([[[0.0, 0.0, 1.0, torch.inf]]]).expand(len(hands.labels), 1, 4)
-    return plain_scenes(hands.centres_m, hands.axes_m, hands.labels, planes)
+    return plain_scenes(hands.centres_m, hands.axes_m, hands.labels)
 
 
 def clean_sensors(n: int) -> torch.Tensor:
@@ -184,11 +183,12 @@ class FixedDetector:
 
 
 def plain_scenes(
-    centres_m: torch.Tensor, axes_m: torch.Tensor, labels: torch.Tensor, planes: torch.Tensor
+    centres_m: torch.Tensor, axes_m: torch.Tensor, labels: torch.Tensor, plane_m: float = torch.inf
 ) -> Scenes:
-    """Ellipsoids and planes alone."""
-    skinned, parts = torch.zeros_like(labels, dtype=torch.bool), torch.zeros(len(labels), 0, PART)
+    """Ellipsoids alone, and a plane across the optical axis."""
     n = len(labels)
+    planes = torch.tensor([[[0.0, 0.0, 1.0, plane_m]]]).expand(n, 1, 4)
+    skinned, parts = torch.zeros_like(labels, dtype=torch.bool), torch.zeros(n, 0, PART)
     skins = torch.zeros(n, 0, 1, PRIMITIVE), torch.zeros(n, 0, 1), torch.zeros(n, 0, 2)
     return Scenes(centres_m, axes_m, labels, planes, skinned, *skins, parts)
 

@@ -49,18 +49,14 @@ class Moving(NamedTuple):
 
 
 def moving(states: Tensor, shape: HandShape) -> Moving:
-    """Of hands (N, 27), by central differences in double precision."""
-    all_states = states.double().repeat(27, 1)
-    steps = 1e-6 * torch.eye(27, dtype=torch.float64).repeat_interleave(len(states), 0)
-    ends = [
-        forward_kinematics(moved(all_states, step), shape.to(torch.float64))
-        for step in (steps, -steps)
-    ]
-    by = [
-        ((there - here) / 2e-6).unflatten(0, (27, len(states))).to(states.dtype)
-        for there, here in zip(*((end.frames, end.origins_m) for end in ends), strict=True)
-    ]
-    return Moving(forward_kinematics(states, shape), *by)
+    """Of hands (N, 27), by automatic differentiation."""
+
+    def after(step: Tensor) -> tuple[Tensor, Tensor]:
+        end = forward_kinematics(moved(states, step.expand_as(states)), shape)
+        return end.frames, end.origins_m
+
+    by = torch.func.jacfwd(after)(states.new_zeros(27))
+    return Moving(forward_kinematics(states, shape), *(each.movedim(-1, 0) for each in by))
 
 
 def moved(states: Tensor, step: Tensor) -> Tensor:

@@ -17,13 +17,14 @@ from torch import Tensor
 from toftrack.evaluation.trust import TIPS
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.seen_points import SeenPoints, seen_points
 from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import parted
 from toftrack.render.segmentation import Observation
 
 K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])
@@ -46,8 +47,7 @@ def seen_hand(shape: HandShape, seed: int, n: int = 1) -> tuple[Tensor, SeenPoin
     state, g = torch.zeros(1, 27), generator(seed)
     state[0, :3] = torch.tensor([0.0, 0.05, 0.45])
     state[0, 3:] = 0.2 * torch.randn(24, generator=g)
-    both = hand_surface(shape).pose(forward_kinematics(state, shape))
-    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    hand, _ = parted(hand_surface(shape).pose(forward_kinematics(state, shape)))
     depth = render_range_images(hand, K, 144, 176)[0]
     observation = Observation(depth, depth > 0, torch.zeros_like(depth, dtype=torch.bool), K, 0.4)
     return state, seen_points(observation), state + SPREAD * torch.randn(n, 27, generator=g)

@@ -16,6 +16,7 @@ from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import render_range_images
+from toftrack.render.model_image import parted
 from toftrack.render.numba import kernel
 from toftrack.render.numba.vector import WORDS
 from toftrack.render.reference import ReferenceScorer, step_range_images
@@ -286,8 +287,7 @@ def _posed(n: int, seed: int, dtype: torch.dtype) -> Ellipsoids:
     states = random_states(n, (0.3, 0.8), seed)
     states[:, :2] *= 0.5
     shape = default_hand_shape().to(dtype)
-    both = hand_surface(shape).pose(forward_kinematics(states.to(dtype), shape))
-    return Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    return parted(hand_surface(shape).pose(forward_kinematics(states.to(dtype), shape)))[0]
 
 
 def test_depth_in_single_precision():
@@ -321,8 +321,7 @@ def test_rendered_depths_are_those_of_the_closed_form() -> None:
     states[0, 0], states[1, 2] = 9.0, -0.5  # beside the image, and behind the camera
     for shown in (states, states[:1]):
         evidence = random_evidence(shape, 48, 64, 4.0, 0.5, 6)
-        posed = hand_surface(shape).pose(forward_kinematics(shown, shape))
-        posed = Ellipsoids(posed.centres_m[:, :-1], posed.axes_m[:, :-1])  # without the wrist
+        posed, _ = parted(hand_surface(shape).pose(forward_kinematics(shown, shape)))
         found = rendered_depths(shown, shape, evidence)
         right = render_range_images(posed, evidence.k, 48, 64)
         assert found.shape == right.shape and ((found > 0) != (right > 0)).sum() <= 2

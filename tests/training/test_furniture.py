@@ -56,8 +56,7 @@ def test_a_place_on_a_piece_is_in_it_or_nearly() -> None:
 
 def test_it_is_seen_and_is_no_hand() -> None:
     none = torch.zeros(N, 1, 3), torch.eye(3).expand(N, 1, 3, 3), torch.full((N, 1), -1)
-    empty = plain_scenes(*none, torch.tensor([0.0, 0.0, 1.0, torch.inf]).expand(N, 1, 4))
-    scenes = replace(empty, parts=pieces(torch.ones(N, dtype=torch.bool)))
+    scenes = replace(plain_scenes(*none), parts=pieces(torch.ones(N, dtype=torch.bool)))
     depth, labels = clean_picture(scenes, intrinsics(100.0, 80, 96), 80, 96)
     seen = (depth > 0).reshape(N, -1).sum(1)
     assert (seen > 30).mean() > 0.8 and depth[depth > 0].min() > 0.05

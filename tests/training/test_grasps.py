@@ -139,9 +139,7 @@ def test_a_thing_is_where_its_hand_is(left: bool, monkeypatch: pytest.MonkeyPatc
     assert float(held.float().mean()) > 0.5
     middle = (posed.parts[:, 0, 1:4] - posed.pivot_m).norm(dim=1)[held]
     assert float(middle.median()) < 0.09 and float(middle.max()) < 0.25
-    planes = torch.tensor([[[0.0, 0.0, 1.0, torch.inf]]]).expand(n, 1, 4)
-    none = torch.full_like(posed.labels, -1)
-    scene = plain_scenes(posed.centres_m, posed.axes_m, none, planes)
+    scene = plain_scenes(posed.centres_m, posed.axes_m, torch.full_like(posed.labels, -1))
     k = intrinsics(200.0, 120, 160)
     depth, labels = clean_picture(replace(scene, parts=posed.parts), k, 120, 160)
     seen = (labels == THING).any((1, 2))

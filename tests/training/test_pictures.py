@@ -33,9 +33,8 @@ K = intrinsics(180.0, HEIGHT, WIDTH)
 
 def plate(depth_m: float) -> Scenes:
     """A wall across the optical axis, and no ellipsoid."""
-    planes = torch.tensor([[[0.0, 0.0, 1.0, depth_m]]])
     none = torch.zeros(1, 1, 3), torch.eye(3)[None, None], torch.full((1, 1), -1)
-    return plain_scenes(*none, planes)
+    return plain_scenes(*none, depth_m)
 
 
 def sensed(scene: Scenes, seed: int = 1, **terms: float) -> np.ndarray:
@@ -80,7 +79,6 @@ def test_what_is_in_front_hides_what_is_behind() -> None:
         torch.cat((scene.centres_m, ball[0]), 1),
         torch.cat((scene.axes_m, ball[1]), 1),
         torch.cat((scene.labels, torch.tensor([[BACKGROUND]])), 1),
-        scene.planes,
     )
     before, _ = clean_picture(scene, K, HEIGHT, WIDTH)
     depth, labels = clean_picture(with_ball, K, HEIGHT, WIDTH)
@@ -111,7 +109,7 @@ def test_the_terms_of_a_sensor_do_what_they_say() -> None:
     assert 0.001 < (sensed(wall, PATCHES=2.0) == 0).mean() < 0.5
 
     hand = alone(one_hand(0, (0.0, 0.0, 0.4)))
-    scene = plain_scenes(hand.centres_m, hand.axes_m, hand.labels, plate(0.8).planes)
+    scene = plain_scenes(hand.centres_m, hand.axes_m, hand.labels, 0.8)
     clean = sensed(scene)
     assert sensed(scene, BLUR=1.0) == pytest.approx(clean, abs=0.02)
     flying = sensed(scene, FLYING=1.0)
@@ -127,7 +125,7 @@ def test_narrow_hollows_seem_deeper_and_nothing_else_does() -> None:
     centres = torch.tensor([[[0.0, 0.0, floor + 0.02], *[[x, 0.0, 0.49] for x in ridges]]])
     flat = [torch.tensor([0.2, 0.2, 0.02]), *[torch.tensor([0.01, 0.2, 0.02])] * 2]
     axes = torch.stack([axis.diag() for axis in flat])[None]
-    scene = plain_scenes(centres, axes, torch.full((1, 3), HAND), plate(0.9).planes)
+    scene = plain_scenes(centres, axes, torch.full((1, 3), HAND), 0.9)
     clean, late = sensed(scene), sensed(scene, HOLLOW=1.0)
     deeper = late - clean
     middle = HEIGHT // 2, WIDTH // 2

@@ -36,8 +36,7 @@ def hands(name: str, seed: int = 0, left: bool = False) -> Hands:
 def scenes(posed: Hands, blend_m: float | None = None) -> Scenes:
     """The hands alone, with a skin of that width, or None for their ellipsoids."""
     labels = torch.where(posed.labels == HAND, posed.labels, -1)
-    planes = torch.tensor([[[0.0, 0.0, 1.0, torch.inf]]]).expand(N, 1, 4)
-    plain = plain_scenes(posed.centres_m, posed.axes_m, labels, planes)
+    plain = plain_scenes(posed.centres_m, posed.axes_m, labels)
     if blend_m is None:
         return plain
     covered = posed.labels == HAND
