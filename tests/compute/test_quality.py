@@ -16,8 +16,6 @@ from toftrack.errors import ToftrackError
 from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.tracker import Tracker
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 BUDGET_S = 0.033
 EVERYTHING = len(LEVELS) - 1
 

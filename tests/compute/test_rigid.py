@@ -17,7 +17,6 @@ from toftrack.compute import rigid, rigid_numba
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 
-pytestmark = pytest.mark.usefixtures("one_thread")
 both = pytest.mark.parametrize(
     "motions", [rigid.MOTIONS, rigid_numba.MOTIONS], ids=["torch", "numba"]
 )

@@ -11,8 +11,6 @@ from torch import Tensor
 
 from toftrack.compute import rotations
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.fixture(params=[torch.float32, torch.float64])
 def rotvecs(request: pytest.FixtureRequest) -> Tensor:

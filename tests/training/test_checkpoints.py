@@ -13,8 +13,6 @@ from toftrack.detector.weights import save_weights
 from toftrack.errors import ToftrackError
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from, save
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
     network = torch.nn.Linear(2, 2)

@@ -29,8 +29,6 @@ from toftrack.training.checkpoints import Checkpoints, Progress
 from toftrack.training.descent import Schedule, train_network
 from toftrack.training.shapes import ShapeBank
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
 train_poses, train_finder = partial(train_network, PoseNet), partial(train_network, Finder)
 

@@ -5,15 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from helpers.detection import clean_picture, dice, distance_to, intrinsics, plain_scenes
 
 from toftrack.training.furniture import PIECES, before_camera, frames, furniture, on_a_piece
 from toftrack.training.hands import HAND, OTHER_HAND
 from toftrack.training.things_numba import BALL, BOX, CONE, PART
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 N = 64
 

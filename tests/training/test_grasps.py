@@ -22,8 +22,6 @@ from toftrack.training.hands import HAND, THING, posed_hands, random_grasps
 from toftrack.training.held_things import _PHONE_M
 from toftrack.training.things_numba import BALL, BOX, CONE, RING
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 N = 300
 
 

@@ -23,8 +23,6 @@ from toftrack.training.hands import (
 )
 from toftrack.training.shown_poses import SHOWN, shown_only
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 N = 1500
 
 

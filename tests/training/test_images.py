@@ -25,8 +25,6 @@ from toftrack.training.images import (
 )
 from toftrack.training.pictures import Lens, read_pictures
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 N = 48
 
 

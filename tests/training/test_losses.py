@@ -23,8 +23,6 @@ from toftrack.training.images import WIDE_SIZE, Crops, WideImages, crop_images, 
 from toftrack.training.losses import finder_loss, hypothesis_joints, pose_losses
 from toftrack.training.shown_poses import shown_poses
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 N = 6
 
 

@@ -9,8 +9,6 @@ from torch import nn
 from toftrack.training import muon
 from toftrack.training.muon import Muon, orthogonal
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 @pytest.mark.parametrize("half", [torch.bfloat16, torch.float32])
 @pytest.mark.parametrize("size", [(24, 24), (8, 200), (200, 8)])

@@ -25,8 +25,6 @@ from toftrack.training.hands import BACKGROUND, FOREARM, HAND, posed_hands
 from toftrack.training.pictures import random_sensors, take_pictures
 from toftrack.training.scenes import Scenes
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 HEIGHT, WIDTH = 120, 160
 K = intrinsics(180.0, HEIGHT, WIDTH)
 

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 import torch
 from helpers.detection import small_bank
 
 from toftrack.training.sequences import CAMERAS, Sequence, random_sequence
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def sequence(seed: int, frames: int = 4) -> Sequence:

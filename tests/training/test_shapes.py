@@ -13,8 +13,6 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface, hand_surface
 from toftrack.training.shapes import cupped, shape_bank
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 
 def test_hands_are_as_long_as_those_of_children_and_adults() -> None:
     bank = shape_bank(150, torch.Generator().manual_seed(1))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
 import torch
 from helpers.detection import dice
 
@@ -10,8 +9,6 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.training import shown_poses as poses
-
-pytestmark = pytest.mark.usefixtures("one_thread")
 
 N = 400
 NAMES = [shown.name for shown in poses.SHOWN]

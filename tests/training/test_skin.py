@@ -16,8 +16,6 @@ from toftrack.training.scenes import Scenes, moved
 from toftrack.training.shapes import shape_bank
 from toftrack.training.shown_poses import SHOWN, shown_only
 
-pytestmark = pytest.mark.usefixtures("one_thread")
-
 HEIGHT, WIDTH = 144, 176
 K = intrinsics(260.0, HEIGHT, WIDTH)
 N = 6
