@@ -1,6 +1,7 @@
 """The other method beside the tracker, with a pretended MediaPipe where there is no real one."""
 
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -55,7 +56,7 @@ def pretended(folder: Path, monkeypatch: pytest.MonkeyPatch, ends: int = 1000) -
 def test_frames_go_out_and_joints_come_back(tmp_path, monkeypatch) -> None:
     pretended(tmp_path, monkeypatch)
     depth, amplitude = np.full((144, 176), 0.5, np.float32), np.zeros((144, 176), np.uint16)
-    with Peer(sys.executable) as found:
+    with closing(Peer(sys.executable)) as found:
         found.begin(Camera(K, 176, 144), "right")
         first, second = found.step(depth, amplitude), found.step(depth, amplitude)
     assert found.versions["mediapipe"] == "0"
@@ -68,7 +69,7 @@ def test_frames_go_out_and_joints_come_back(tmp_path, monkeypatch) -> None:
 def test_a_peer_that_ends_says_its_last_words(tmp_path, monkeypatch) -> None:
     pretended(tmp_path, monkeypatch, ends=1)
     depth, amplitude = np.zeros((4, 4), np.float32), np.zeros((4, 4), np.uint16)
-    with Peer(sys.executable) as found:
+    with closing(Peer(sys.executable)) as found:
         found.begin(Camera(K, 4, 4))
         found.step(depth, amplitude)
         with pytest.raises(ToftrackError, match=r"ended in the middle .*out of breath"):

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import asdict, dataclass, field
 from itertools import count
 from pathlib import Path
@@ -170,7 +170,7 @@ def _peer(hands: int, python: str) -> Iterator[Runner]:
         camera, frames = device.camera, list(device)
     images = [(camera.rectify(f.depth, f.radial), np.asarray(f.amplitude)) for f in frames]
     images += images[-2:0:-1]
-    with Peer(python) as peer:
+    with closing(Peer(python)) as peer:
         peer.begin(camera, "right", hands)
 
         def once() -> list[float]:

@@ -49,7 +49,7 @@ class PeerEstimate:
 
 
 class Peer:
-    """The peer's process, for a `with`; `begin` a recording, then `step` through its frames."""
+    """The peer's process, to be closed; `begin` a recording, then `step` through its frames."""
 
     def __init__(self, python: str | Path) -> None:
         """Start it with its environment's Python. Raises ToftrackError: that lacks MediaPipe."""
@@ -70,12 +70,6 @@ class Peer:
         assert self._process.stdin is not None and self._process.stdout is not None
         self._to, self._from = self._process.stdin, self._process.stdout
         self.versions = self._greeting()
-
-    def __enter__(self) -> Peer:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the process."""

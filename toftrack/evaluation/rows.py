@@ -16,6 +16,7 @@ number of frames that is given with them is that of one seed on average.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -196,13 +197,11 @@ def interval_name(key: str) -> str:
 def groups(rows: Sequence[Row]) -> dict[str, dict[str, Row]]:
     """By kind of group and group: figures over its frames, pooled; see the head of this module.
     Bands are in the order of their values, other groups in that of their names."""
-    sums: dict[str, dict[str, dict[str, float]]] = {}
+    sums: dict[str, dict[str, Counter]] = {}
     for row in rows:
         for kind, found in row.get("groups", {}).items():
             for name, counts in found.items():
-                mine = sums.setdefault(kind, {}).setdefault(name, {})
-                for key, value in counts.items():
-                    mine[key] = mine.get(key, 0) + value
+                sums.setdefault(kind, {}).setdefault(name, Counter()).update(counts)
     seeds = max(len({row["seed"] for row in rows}), 1)
     return {
         kind: {
