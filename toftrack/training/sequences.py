@@ -64,14 +64,8 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
     others = 0.0 if empty else 0.2  # which may be as right a hand as the missing one
     scene = int(torch.randint(2**31 - 1, (1,), generator=generator))
     sensor = random_sensors(1, dice)
-    middle = torch.tensor([[(width - 1) / 2, (height - 1) / 2]])
-    lens = Lens(
-        torch.tensor([focal]),
-        middle[:, 0],
-        middle[:, 1],
-        torch.tensor([float(width)]),
-        torch.tensor([float(height)]),
-    )
+    k = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1]])
+    lens = Lens(*torch.tensor([[focal], [k[0, 2]], [k[1, 2]], [width], [height]]))
     images, joints, seen = [], [], []
     for frame in range(frames):
         key, part = divmod(frame / _KEY, 1)
@@ -92,14 +86,8 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         joints.append(hands.joints_m[0])
         area = (focal / float(pivot[2])) ** 2 * 0.0105 * math.exp(2 * float(hands.log_size))
         seen.append((which == HAND).sum() / area > 0.1)
-    k = np.array([[focal, 0, float(middle[0, 0])], [0, focal, float(middle[0, 1])], [0, 0, 1]])
-    return Sequence(
-        np.stack(images),
-        k,
-        torch.stack(joints).numpy(),
-        np.array(seen),
-        "left" if bool(left) else "right",
-    )
+    side = "left" if bool(left) else "right"
+    return Sequence(np.stack(images), k, torch.stack(joints).numpy(), np.array(seen), side)
 
 
 def _places(keys: int, wide: float, high: float, dice: Dice) -> Tensor:

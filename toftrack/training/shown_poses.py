@@ -16,7 +16,7 @@ from torch import Tensor
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.pose_space.base import clamp_to_joint_limits
-from toftrack.pose_space.data.pose_data import recorded_poses
+from toftrack.pose_space.data.pose_data import THUMBS, recorded_poses
 from toftrack.training.dice import Dice
 
 KINDS = {
@@ -44,16 +44,7 @@ _STATES = {
     "bent": ((75, 7, 4), (13, 8, 6)),  # straight, bent at the knuckle
     "over": ((70, 75, 25), (9, 12, 10)),  # over the thumb
 }
-_THUMBS = {
-    "out": (4, 2, 5, -8, -8),
-    "up": (35, -8, 5, -10, -5),
-    "beside": (-30, 5, -8, 10, 10),
-    "across": (0, 42, -20, 30, 28),
-    "tucked": (-12, 35, -15, 55, 60),
-    "hooked": (4, 2, 5, 25, 60),
-    "opposed": (10, 20, 0, 15, 20),
-    "folded": (-20, 38, -10, 25, 40),
-}
+_THUMBS = THUMBS | {"opposed": (10, 20, 0, 15, 20), "folded": (-20, 38, -10, 25, 40)}
 # What any finger may do: straight, curled, hooked, half bent, bent at the knuckle.
 _ANY_MEANS = torch.tensor(
     [(0.0, 3.0, 2.0), (85.0, 98.0, 50.0), (5.0, 90.0, 50.0), (35.0, 40.0, 20.0), (72.0, 8.0, 4.0)]
@@ -86,10 +77,11 @@ def _four(state: str) -> tuple[str, str, str, str]:
     return (state, state, state, state)
 
 
+_UP = ("out", "up")
 _CLOSED = ("across", "tucked", "hooked", "folded")
 SHOWN = (
     Shown("palm", ("out", "up", "beside"), _four("straight"), _APART, 6),
-    Shown("stretched palm", ("out", "up"), _four("back"), _APART, 5),
+    Shown("stretched palm", _UP, _four("back"), _APART, 5),
     Shown("flat", ("beside", "beside", "beside", "out"), _four("straight"), _TOGETHER, 11),
     Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
     Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 18),
@@ -99,28 +91,20 @@ SHOWN = (
     Shown("thumb up, loose", ("up", "out"), _four("loose"), _ANY, 2),
     Shown("point", _CLOSED, ("straight", "tight", "tight", "tight"), _ANY, 7),
     Shown("point, loose", _CLOSED, ("straight", "loose", "loose", "loose"), _ANY, 3),
-    Shown("point with thumb", ("out", "up"), ("straight", "tight", "tight", "tight"), _ANY, 7),
-    Shown(
-        "point with thumb, loose", ("out", "up"), ("straight", "loose", "loose", "loose"), _ANY, 3
-    ),
+    Shown("point with thumb", _UP, ("straight", "tight", "tight", "tight"), _ANY, 7),
+    Shown("point with thumb, loose", _UP, ("straight", "loose", "loose", "loose"), _ANY, 3),
     Shown("bent index", _CLOSED, ("hooked", "tight", "tight", "tight"), _ANY, 2),
     Shown("victory", _CLOSED, ("straight", "straight", "tight", "tight"), _APART, 6),
-    Shown("victory with thumb", ("out", "up"), ("straight", "straight", "tight", "tight"), _ANY, 3),
+    Shown("victory with thumb", _UP, ("straight", "straight", "tight", "tight"), _ANY, 3),
     Shown("two together", _CLOSED, ("straight", "straight", "tight", "tight"), _TOGETHER, 3),
     Shown("crossed fingers", _CLOSED, ("straight", "half", "tight", "tight"), _CROSSED, 1),
     Shown("three", _CLOSED, ("straight", "straight", "straight", "tight"), _ANY, 5),
     Shown("four", ("tucked", "folded", "across"), _four("straight"), _ANY, 5),
     Shown("flat, thumb folded", ("folded", "across", "tucked"), _four("straight"), _TOGETHER, 3),
     Shown("index and little", _CLOSED, ("straight", "tight", "tight", "straight"), _ANY, 4),
-    Shown(
-        "thumb, index and little",
-        ("out", "up"),
-        ("straight", "tight", "tight", "straight"),
-        _ANY,
-        3,
-    ),
+    Shown("thumb, index and little", _UP, ("straight", "tight", "tight", "straight"), _ANY, 3),
     Shown("little", _CLOSED, ("tight", "tight", "tight", "straight"), _ANY, 6),
-    Shown("thumb and little", ("out", "up"), ("tight", "tight", "tight", "straight"), _ANY, 3),
+    Shown("thumb and little", _UP, ("tight", "tight", "tight", "straight"), _ANY, 3),
     Shown("middle", _CLOSED, ("tight", "straight", "tight", "tight"), _ANY, 1),
     Shown("bent knuckles", ("beside", "opposed", "out"), _four("bent"), _ANY, 6),
     Shown("flat beak", ("opposed", "across"), _four("bent"), _TOGETHER, 2),

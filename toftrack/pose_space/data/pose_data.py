@@ -41,7 +41,7 @@ _CURLED = {
     "little": (0, 90, 100, 50),
 }
 _SPREAD = {"index": 2, "middle": 0, "ring": -2, "little": -4}
-_THUMB = {
+THUMBS = {
     "out": (4, 2, 5, -8, -8),
     "up": (35, -8, 5, -10, -5),
     "beside": (-30, 5, -8, 10, 10),
@@ -121,7 +121,7 @@ class PoseData:
 
 def basic_pose(gesture: str, thumb: str | None = None) -> Tensor:
     """Joint angles of a basic pose, (21,) radians float64; `thumb` overrides its thumb."""
-    degrees = list(_THUMB[thumb or _BASIC_THUMB[gesture]])
+    degrees = list(THUMBS[thumb or _BASIC_THUMB[gesture]])
     for finger, curled in _CURLED.items():
         straight = gesture == "palm" or (gesture == "gun" and finger == "index")
         pose = _STRAIGHT if straight else curled
@@ -135,7 +135,7 @@ def _transformation(first: str, second: str, done: float) -> Tensor:
     Each angle's part done has the odds of `done` times its own lead: it moves all the time, and
     from end to end.
     """
-    leads = [0.0] * len(_THUMB["out"])
+    leads = [0.0] * len(THUMBS["out"])
     for finger in _CURLED:
         leads += [_LEAD[finger] + joint for joint in _JOINT_LEAD]
     progress = torch.tensor(leads, dtype=torch.float64).exp() * done
@@ -155,7 +155,7 @@ def synthetic_data() -> PoseData:
     for first, second, done, thumbs in _THUMB_CONFIGURATIONS:
         for thumb in thumbs:
             pose = _transformation(first, second, done)
-            pose[: len(_THUMB[thumb])] = basic_pose(first, thumb)[: len(_THUMB[thumb])]
+            pose[: len(THUMBS[thumb])] = basic_pose(first, thumb)[: len(THUMBS[thumb])]
             poses.append(pose)
             labels.append(f"{first}-{second}+{thumb}")
     names = list(dict.fromkeys(labels))
