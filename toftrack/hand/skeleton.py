@@ -63,6 +63,9 @@ ANGLE_LIMITS: tuple[tuple[float, float], ...] = tuple(
 # flexion): the thumb uses all five, the others have no abduction at their second joint.
 CHAIN_SLOTS = (*range(5), *(5 * f + s for f in range(1, 5) for s in (0, 1, 3, 4)))
 """Where each of the 21 angles goes in the (5 fingers x 5 slots) layout of the chain."""
+SLOT_BONES = [0, 0, 1, 1, 2]
+"""The bone of a finger that each of its slots is the first to turn, about an axis through its
+proximal end: the z axis of the bone before (of the rest frame), or its own x axis."""
 
 
 class HandPose(NamedTuple):

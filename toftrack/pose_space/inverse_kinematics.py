@@ -14,7 +14,13 @@ import torch
 from torch import Tensor
 
 from toftrack.hand.shape import HandShape
-from toftrack.hand.skeleton import ANGLE_LIMITS, CHAIN_SLOTS, HandPose, forward_kinematics
+from toftrack.hand.skeleton import (
+    ANGLE_LIMITS,
+    CHAIN_SLOTS,
+    SLOT_BONES,
+    HandPose,
+    forward_kinematics,
+)
 
 _UNIT_M = 1e-2
 """Residuals are near one in this unit, so that damping and prior need none."""
@@ -138,9 +144,8 @@ def fit_angles(
 def joint_jacobian(pose: HandPose, shape: HandShape) -> Tensor:
     """Derivatives of the 20 finger joints by the 27 degrees of freedom of right hands.
 
-    A turn about an axis through an origin moves a joint by axis x (joint - origin). Flexion turns
-    about its own bone's x axis, abduction about the z axis of the bone before (for the first bone:
-    of the finger's rest frame). The three global rotations are about the camera's axes.
+    A turn about an axis through an origin moves a joint by axis x (joint - origin); see SLOT_BONES.
+    The three global rotations are about the camera's axes.
 
     Returns (T, 60, 27), metres per metre or radian.
     """
@@ -151,10 +156,9 @@ def joint_jacobian(pose: HandPose, shape: HandShape) -> Tensor:
     axes = torch.stack(
         (rest_z, bones[:, :, 0, :, 0], bones[:, :, 0, :, 2], *bones[:, :, 1:, :, 0].unbind(2)), 2
     )  # (T, 5, 5 slots, 3)
-    first = (0, 0, 1, 1, 2)  # the bone that a slot turns
-    lever = joints[:, :, None] - origins[:, :, first, None]  # (T, 5, slots, 4 joints, 3)
+    lever = joints[:, :, None] - origins[:, :, SLOT_BONES, None]  # (T, 5, slots, 4 joints, 3)
     moves = torch.linalg.cross(axes[:, :, :, None].expand_as(lever), lever)
-    carried = [[joint > bone for joint in range(4)] for bone in first]
+    carried = [[joint > bone for joint in range(4)] for bone in SLOT_BONES]
     moves = moves * moves.new_tensor(carried)[..., None]
 
     count = len(joints)

@@ -25,26 +25,6 @@ from torch import Tensor
 
 from toftrack.errors import check_number
 
-# The joints of the 21 angles: (finger, bone that moves first, is it an abduction).
-_JOINTS = [
-    (finger, bone, abduction)
-    for finger in range(5)
-    for bone, abduction in ((0, True), (0, False), (1, True), (1, False), (2, False))
-    if finger == 0 or (bone, abduction) != (1, True)
-]
-AXIS_ROW = tuple(
-    3 * finger + bone if not abduction else 15 + finger if bone == 0 else 20
-    for finger, bone, abduction in _JOINTS
-)
-"""Rows of the table of axes that shape_fit builds: the x axes of the 15 bones (flexion), the
-z axes of the 5 base frames (abduction of the first joint), the z axis of the thumb's first bone."""
-ORIGIN_ROW = tuple(1 + 3 * finger + bone for finger, bone, _ in _JOINTS)
-"""The frames in whose origins these axes lie."""
-MOVES = tuple(
-    tuple(f > 0 and finger == (f - 1) // 3 and bone <= (f - 1) % 3 for finger, bone, _ in _JOINTS)
-    for f in range(16)
-)
-"""(16, 21) which angles move a point that is attached to a frame."""
 JOINT_FRAME = (0, *(3 * finger + bone if bone else 0 for finger in range(5) for bone in range(4)))
 """The frame that each of the 21 joints moves with: that of the bone which ends there."""
 

@@ -32,15 +32,8 @@ from torch import Tensor
 from toftrack.compute.rotations import rotation_matrix
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
-from toftrack.hand.skeleton import HandPose
-from toftrack.refinement.gauss_newton import (
-    AXIS_ROW,
-    JOINT_FRAME,
-    KEYPOINT_SIGMAS,
-    MOVES,
-    ORIGIN_ROW,
-    Keypoints,
-)
+from toftrack.hand.skeleton import CHAIN_SLOTS, SLOT_BONES, HandPose
+from toftrack.refinement.gauss_newton import KEYPOINT_SIGMAS, Keypoints
 
 _COUNT = len(COMPONENTS)
 _SURE_M = 0.004
@@ -69,8 +62,11 @@ only frames that count so many times as much are."""
 KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
 Of rendered sequences of other hands, like what is said above."""
-_JOINT_MOVES = np.array(MOVES)[list(JOINT_FRAME)]
-"""(21, 21) which angles move each joint."""
+_SLOTS = list(CHAIN_SLOTS)
+_BEFORE = np.array([-1, *(4 * finger + joint for finger in range(5) for joint in range(4))])
+_FIRST = np.array([4 * finger + bone for finger in range(5) for bone in SLOT_BONES])[_SLOTS]
+_JOINT_MOVES = (_BEFORE[:, None] // 4 == _FIRST // 4) & (_BEFORE[:, None] > _FIRST)
+"""(21, 21) which angles move each joint: those that turn a bone of its finger before it."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
 _STEP, _STEP_SIGMAS = 0.01, 0.5
@@ -295,14 +291,16 @@ def _joint_jacobian(pose: HandPose, shape: HandShape) -> np.ndarray:
     """
     frames, origins = pose.frames[0].numpy(), pose.origins_m[0].numpy()
     joints = pose.joints_m[0].numpy().astype(np.float64)
-    base = shape.base_frames[:, :, 2].numpy() @ frames[0].T
-    axes = np.concatenate((frames[1:, :, 0], base, frames[1:2, :, 2]))[list(AXIS_ROW)]
+    rest_z = shape.base_frames[:, :, 2].numpy() @ frames[0].T
+    x, z = frames[1:, :, 0].reshape(5, 3, 3), frames[1:, :, 2].reshape(5, 3, 3)
+    axes = np.stack((rest_z, x[:, 0], z[:, 0], x[:, 1], x[:, 2]), 1).reshape(25, 3)[_SLOTS]
+    through = origins[1:].reshape(5, 3, 3)[:, SLOT_BONES].reshape(25, 3)[_SLOTS]
     if shape.side == "left":  # a mirror turns the sense of rotation round
         axes = -axes
     rows = np.zeros((21, 3, 27))
     rows[:, :, :3] = np.eye(3)
     rows[:, :, 3:6] = np.cross(np.eye(3), (joints - origins[0])[:, None]).swapaxes(1, 2)
-    turned = np.cross(axes, joints[:, None] - origins[list(ORIGIN_ROW)])
+    turned = np.cross(axes, joints[:, None] - through)
     rows[:, :, 6:] = (turned * _JOINT_MOVES[..., None]).swapaxes(1, 2)
     return rows.reshape(63, 27)
 
