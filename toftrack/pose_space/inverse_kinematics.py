@@ -166,9 +166,8 @@ def joint_jacobian(pose: HandPose, shape: HandShape) -> Tensor:
     eye = torch.eye(3, dtype=joints.dtype, device=joints.device)
     jacobian[..., :3] = eye
     from_wrist = joints - pose.joints_m[:, None, :1]
-    for axis in range(3):
-        turn = eye[axis].expand_as(from_wrist)
-        jacobian[..., 3 + axis] = torch.linalg.cross(turn, from_wrist)
+    turns = torch.linalg.cross(eye.expand(*from_wrist.shape, 3), from_wrist[..., None, :])
+    jacobian[..., 3:6] = turns.mT
     for finger in range(5):
         jacobian[:, finger, :, :, 6 + 5 * finger : 11 + 5 * finger] = moves[:, finger].permute(
             0, 2, 3, 1
