@@ -24,6 +24,7 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.image_labels import Points, parsed_labels
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
+from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import FINGERS
 
@@ -126,19 +127,19 @@ def label_frames(
     where it is known. Raises ToftrackError when the frames are not those of a whole recording."""
     with one_sentence():
         detector = instantiate(config.detector)
-    K, shown = device.camera.K, []
+    camera, shown = device.camera, []
     for row, frame in enumerate(device):
         if frame.index != row:
             raise ToftrackError(
                 "the tracker is measured on whole recordings; leave out device.start and the like"
             )
         if row in numbers:
-            depth_m = device.camera.rectify(frame.depth, frame.radial)
+            depth_m = camera.rectify(frame.depth, frame.radial)
             estimate = None if known is None or known.estimates[row].lost else known.estimates[row]
-            joints_m = _found(detector, depth_m, K) if estimate is None else estimate.joints_m
+            seen = _found(detector, depth_m, camera.K) if estimate is None else estimate.joints_m
             depth_mm = np.clip(1e3 * depth_m + 0.5, 0, 65535).astype("<u2")
-            pixels = None if estimate is None else _projected(estimate.joints_m, K)
-            shown.append(LabelFrame(row, depth_mm, *_about(joints_m, depth_m, K), pixels))
+            pixels = None if estimate is None else camera.project(estimate.joints_m)
+            shown.append(LabelFrame(row, depth_mm, *_about(seen, depth_m, camera), pixels))
         if len(shown) == len(numbers):
             break
     return shown
@@ -159,7 +160,7 @@ def _found(detector: HandDetector | None, depth_m: np.ndarray, k: np.ndarray) ->
 
 
 def _about(
-    joints_m: np.ndarray | None, depth_m: np.ndarray, k: np.ndarray
+    joints_m: np.ndarray | None, depth_m: np.ndarray, camera: Camera
 ) -> tuple[tuple[float, float], float, float, float]:
     """Centre, reach, near and far of what is shown: the whole image where no hand is known."""
     height, width = depth_m.shape
@@ -167,18 +168,12 @@ def _about(
         seen = depth_m[depth_m > 0]
         near, far = np.percentile(seen, (1, 50)) if seen.size else (0.2, 1.0)
         return ((width - 1) / 2, (height - 1) / 2), max(width, height) / 2, 1e3 * near, 1e3 * far
-    pixels = _projected(joints_m, k)
+    pixels = camera.project(joints_m)
     low, high = pixels.min(0), pixels.max(0)
     u, v = np.clip((low + high) / 2, 0, (width - 1, height - 1))
     near, far = joints_m[:, 2].min() - _BEFORE_M, joints_m[:, 2].max() + _BEHIND_M
     reach = max(_AROUND * float((high - low).max()) / 2, 8.0)
     return (float(u), float(v)), reach, 1e3 * float(near), 1e3 * float(far)
-
-
-def _projected(joints_m: np.ndarray, k: np.ndarray) -> np.ndarray:
-    """(21, 2) pixels of the undistorted image."""
-    pixels: np.ndarray = joints_m[:, :2] / joints_m[:, 2:] * np.diag(k)[:2] + k[:2, 2]
-    return pixels
 
 
 class LabelFile:
