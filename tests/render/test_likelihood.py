@@ -49,20 +49,15 @@ def surfaces(state: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     shape = SHAPE.to(torch.float64)
     both = hand_surface(shape).pose(forward_kinematics(state[None].double(), shape))
     inverse = np.linalg.inv(both.axes_m[0].numpy())
-    centres = both.centres_m[0].numpy()
-    depth, wrist = np.zeros((HEIGHT, WIDTH)), np.zeros((HEIGHT, WIDTH), bool)
-    k = K.double().numpy()
-    for v in range(HEIGHT):
-        for u in range(WIDTH):
-            ray = np.array([(u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], 1.0])
-            p, q = inverse @ ray, np.einsum("eij,ej->ei", inverse, centres)
-            a, b, c = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1) - 1
-            hit = b * b - a * c > 0
-            z = (b - np.sqrt(np.where(hit, b * b - a * c, 0))) / a
-            z = np.where(hit & (z > 0), z, np.inf)
-            depth[v, u] = z[:-1].min() if np.isfinite(z[:-1]).any() else 0
-            wrist[v, u] = np.isfinite(z[-1])
-    return depth, wrist
+    v, u = np.mgrid[:HEIGHT, :WIDTH]
+    rays = np.linalg.inv(K.double().numpy()) @ np.stack((u, v, np.ones_like(u))).reshape(3, -1)
+    p, q = inverse @ rays, inverse @ both.centres_m[0].numpy()[..., None]  # (E, 3, pixels or 1)
+    a, b, c = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1) - 1
+    with np.errstate(invalid="ignore"):
+        z = (b - np.sqrt(b * b - a * c)) / a  # NaN where the ellipsoid is missed
+    z = np.where(z > 0, z, np.inf).reshape(-1, HEIGHT, WIDTH)
+    nearest = z[:-1].min(0)
+    return np.where(nearest < np.inf, nearest, 0), z[-1] < np.inf
 
 
 def scene_of(state: torch.Tensor, seed: int) -> Observation:
@@ -81,37 +76,27 @@ def scene_of(state: torch.Tensor, seed: int) -> Observation:
     return Observation(*as_tensor, K, nearest)
 
 
-def counted_by_a_loop(state: torch.Tensor, seen: Observation, head: FMeasure) -> list[float]:
+def counted_by_definition(state: torch.Tensor, seen: Observation, head: FMeasure) -> list[float]:
     """Correct, false, missed and residual of one hand, as the paper defines them."""
     depth, wrist = surfaces(state)
     silhouette = depth > 0
     away = cv2.distanceTransform((~silhouette).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     radius = head.neighbourhood_m * float(K[0, 0]) / seen.nearest_m
-    correct = false = missed = 0
-    residual = 0.0
-    image, hand, occluder = seen.depth_m.numpy(), seen.hand.numpy(), seen.occluder.numpy()
-    for v in range(HEIGHT):
-        for u in range(WIDTH):
-            z, tolerance = float(image[v, u]), head.tolerance_m
-            if silhouette[v, u]:
-                if hand[v, u] and abs(depth[v, u] - z) <= tolerance:
-                    correct += 1
-                    near, far = 1 / (z - tolerance), 1 / (z + tolerance)
-                    off = 1 / depth[v, u] - (near + far) / 2
-                    residual += (off / ((near - far) / 2)) ** 2
-                elif not occluder[v, u]:
-                    false += 1
-            elif hand[v, u] and not wrist[v, u] and away[v, u] <= radius:
-                missed += 1
-    return [correct, false, missed, residual]
+    z, hand = seen.depth_m.double().numpy(), seen.hand.numpy()
+    correct = silhouette & hand & (np.abs(depth - z) <= head.tolerance_m)
+    false = silhouette & ~correct & ~seen.occluder.numpy()
+    missed = ~silhouette & hand & ~wrist & (away <= radius)
+    near, far = (1 / (z[correct] + off) for off in (-head.tolerance_m, head.tolerance_m))
+    residual = np.square((1 / depth[correct] - (near + far) / 2) / ((near - far) / 2))
+    return [*(pixels.sum() for pixels in (correct, false, missed)), residual.sum()]
 
 
-def test_counts_agree_with_a_loop_over_pixels() -> None:
+def test_counts_agree_with_their_definition() -> None:
     states = hand_states(5, 1)
     head = f_measure(neighbourhood_m=0.03)
     seen = scene_of(states[0], 2)
     counts = ReferenceScorer(SHAPE)(states, head.evidence(seen))
-    expected = torch.tensor([counted_by_a_loop(state, seen, head) for state in states])
+    expected = torch.tensor([counted_by_definition(state, seen, head) for state in states])
     assert (expected[:, :3].amax(0) > 20).all(), "all kinds of pixels occur"
     # Two pixels a hand may lie on an outline or at the edge of the tolerance in single precision.
     assert (torch.stack(counts, 1) - expected).abs().max() <= 2

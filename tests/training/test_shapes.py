@@ -8,9 +8,9 @@ import pytest
 import torch
 from helpers.detection import dice, small_bank
 
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import HandSurface, hand_surface
+from toftrack.hand.surface import hand_surface
 from toftrack.training.shapes import cupped, shape_bank
 
 
@@ -35,10 +35,7 @@ def test_a_row_is_a_hand_as_any_other() -> None:
     ellipsoids = surface.pose(pose)
     assert torch.equal(surface.frame_index, hand_surface(default_hand_shape()).frame_index)
     for i, row in enumerate(rows.tolist()):
-        one = HandShape(*(getattr(bank.shape, n)[row] for n in NAMES))
-        flesh = HandSurface(
-            bank.surface.frame_index, bank.surface.centres_m[row], bank.surface.axes_m[row]
-        )
+        one, flesh = bank.rows(torch.tensor(row))
         alone = forward_kinematics(state[i : i + 1], one)
         assert torch.allclose(alone.joints_m[0], pose.joints_m[i], atol=1e-6)
         posed = flesh.pose(alone)
@@ -46,18 +43,15 @@ def test_a_row_is_a_hand_as_any_other() -> None:
         assert torch.allclose(posed.axes_m[0], ellipsoids.axes_m[i], atol=1e-6)
 
 
-NAMES = ("base_m", "base_frames", "bone_lengths_m")
-
-
 def test_flesh_lies_about_the_bones_of_its_own_hand() -> None:
     """Within some percent of the ellipsoids that this skeleton would be given."""
     bank = small_bank()
     for row in range(4):
-        shape = HandShape(*(getattr(bank.shape, n)[row] for n in NAMES))
+        shape, surface = bank.rows(torch.tensor(row))
         plain = hand_surface(shape)
-        off = bank.surface.centres_m[row] - plain.centres_m
+        off = surface.centres_m - plain.centres_m
         assert off.norm(dim=1).max() < 0.008
-        grown = bank.surface.axes_m[row].norm(dim=1) / plain.axes_m.norm(dim=1)
+        grown = surface.axes_m.norm(dim=1) / plain.axes_m.norm(dim=1)
         # Thickness varies by 10 %, within 0.75 and 1.35, and each axis by 6 %.
         assert 0.5 < float(grown.min()) and float(grown.max()) < 1.8
         assert float(grown.log().std()) > math.log(1.02)
