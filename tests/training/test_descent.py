@@ -65,7 +65,7 @@ def test_a_seed_gives_the_same_weights(train, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"images": 0}, "images of a network must be a whole number above 0"),
+        ({"images": 0}, "images=0 is not possible; give a whole number of at least 1, or 0 with"),
         ({"rate": 1.5}, "rate of a network must be between 0 and 1"),
     ],
 )

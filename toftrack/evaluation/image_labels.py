@@ -86,13 +86,10 @@ def read_labels(path: str | Path) -> Points | Stills:
 def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
     """Labels of either kind as they stand in a file; where `begun`, points may still be without
     any that is visible. Raises ToftrackError, one sentence that names the file."""
-    try:
+    what = f"the labels '{path}' are of neither kind that {__name__} describes"
+    damaged = KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError
+    with reported_errors(what, "give points or stills", *damaged):
         return _parsed(path, content, begun)
-    except (KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError) as error:
-        raise ToftrackError(
-            f"the labels '{path}' are of neither kind that toftrack/evaluation/image_labels.py "
-            f"describes ({type(error).__name__}: {error}); give points or stills"
-        ) from None
 
 
 def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:

@@ -15,7 +15,7 @@ import numpy as np
 
 from toftrack.compute.compiling import entry_point
 from toftrack.compute.rigid_numba import distance
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.hand.surface import hand_surface
@@ -44,8 +44,7 @@ class PinchSettings:
             raise ToftrackError(
                 "gestures.pinch.end must be below gestures.pinch.begin, both in 0 .. 1"
             )
-        if not 0 <= self.frames < math.inf:
-            raise ToftrackError("gestures.pinch.frames must be 0 or more")
+        check_number("gestures.pinch.frames", self.frames, 0)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.pose_space.base import PoseSpace, check_dims, signed, tensor32
 
 # Widths of the map's kernel in parts of the median distance between training latents, and ridges
@@ -164,8 +164,9 @@ class KernelPCAPoseSpace(KernelDecodedSpace):
 
         x = angles.double().cpu().numpy()
         check_dims(dims, len(x), len(x) - 1)
-        if gamma is not None and gamma <= 0:
-            raise ToftrackError(f"pose_space.gamma={gamma} must be above 0, in 1 / rad^2, or null")
+        if gamma is not None:
+            remedy = ", in 1 / rad^2, or null"
+            check_number("pose_space.gamma", gamma, 0, above=True, remedy=remedy)
         square = _squared_distances(x)
         median = _median(square)
         fits = []
@@ -225,10 +226,10 @@ class NeighbourSpace(KernelDecodedSpace):
         x = angles.double().cpu().numpy()
         most = len(x) - 1
         check_dims(dims, len(x), min(most - 1, x.shape[1]))
-        if neighbours is not None and not dims < neighbours <= most:
-            raise ToftrackError(
-                f"pose_space.neighbours={neighbours} must be above the {dims} dimensions and at"
-                f" most {most} for {len(x)} poses, or null"
+        if neighbours is not None:
+            remedy = f" for {dims} dimensions of {len(x)} poses, or null"
+            check_number(
+                "pose_space.neighbours", neighbours, dims + 1, most, whole=True, remedy=remedy
             )
         numbers = (neighbours,) if neighbours else {min(max(k, dims + 1), most) for k in cls.tried}
         fits = []

@@ -22,7 +22,7 @@ from toftrack.detector.weights import (
     other_networks_refused,
     read_arrays,
 )
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_to_read, whole_file
 
 _SUFFIX = ".checkpoint.pt"
@@ -117,7 +117,8 @@ def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
 
 
 def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    try:
+    what = f"{path} is no checkpoint of a training of the detector"
+    with reported_errors(what, "train without resume", *_BROKEN):
         with open_to_read(path) as stream:
             content = torch.load(stream, map_location="cpu", weights_only=True)
         before = content["settings"]
@@ -133,11 +134,6 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
             setattr(progress, name, content[name])
         recent = content["recent"]
         progress.names, progress.recent = list(recent), torch.tensor(list(recent.values()))
-    except _BROKEN as error:
-        why = str(error).partition("\n")[0]
-        raise ToftrackError(
-            f"{path} is no checkpoint of a training of the detector ({why}); train without resume"
-        ) from None
 
 
 def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:

@@ -30,7 +30,7 @@ from tqdm import tqdm
 from toftrack.compute.transfer import on_device
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.weights import checksum
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.training.batches import Batches, keep_memory, made_batches, makers, makers_watched
 from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
 from toftrack.training.images import Crops, WideImages, crop_images, wide_images
@@ -72,13 +72,10 @@ class Schedule:
     restart_rate: float = 0.0012
 
     def __post_init__(self) -> None:
-        for name in ("images", "batch", "width"):
-            least = 0 if name == "images" and self.start is not None else 1
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= least):
-                more = "" if name != "images" else ", or 0 with weights to start from"
-                raise ToftrackError(f"{name} of a network must be a whole number above 0{more}")
-        if not (isinstance(self.restart_images, int) and self.restart_images >= 0):
-            raise ToftrackError("restart_images of a network must be a whole number, 0 or more")
+        fewest, more = (1, ", or 0 with weights to start from") if self.start is None else (0, "")
+        check_number("images", self.images, fewest, whole=True, remedy=more)
+        for name, least in (("batch", 1), ("width", 1), ("restart_images", 0)):
+            check_number(name, getattr(self, name), least, whole=True)
         for name in ("rate", "restart_rate"):
             if not 0 < getattr(self, name) < 1:
                 raise ToftrackError(f"{name} of a network must be between 0 and 1")

@@ -66,8 +66,7 @@ def train(config: DictConfig) -> float:
     for schedule in (poses, finder):
         if schedule.start is not None:
             load_weights(schedule.start)  # an error now, not after hours
-    if not (isinstance(config.shapes, int) and config.shapes > 0):
-        raise ToftrackError("shapes must be a whole number above 0: how many hands are drawn from")
+    check_number("shapes", config.shapes, 1, whole=True)
     check_number("checkpoint_minutes", config.checkpoint_minutes, 0, above=True)
     resume = None if config.resume is None else Path(to_absolute_path(config.resume))
     checkpoints = Checkpoints(folder, config.checkpoint_minutes, resume)
