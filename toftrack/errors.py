@@ -6,7 +6,7 @@ import contextlib
 import importlib
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from numbers import Integral, Real
 from types import ModuleType
 from typing import Any
@@ -29,6 +29,15 @@ class ToftrackError(Exception):
 def one_line(text: str) -> str:
     """A text with names that others chose, as a terminal may show it: no line ends, no escapes."""
     return _CONTROL.sub(" ", text)
+
+
+def check_choice(key: str, value: Any, known: Collection[str], remedy: str = "") -> None:
+    """Raise ToftrackError unless a setting is one of those that are known.
+
+    key: the setting's name on the command line.  remedy: what else to do, added to the sentence.
+    """
+    if value not in known:
+        raise ToftrackError(f"{key}={value} is unknown; give one of {', '.join(known)}{remedy}")
 
 
 @contextlib.contextmanager

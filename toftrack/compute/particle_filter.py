@@ -17,7 +17,7 @@ from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
 from toftrack.compute.rigid import BOUNDS, Redraw
-from toftrack.errors import ToftrackError, check_number
+from toftrack.errors import check_choice, check_number
 
 RESAMPLERS = ("systematic", "stratified")
 
@@ -64,15 +64,8 @@ class FilterSettings:
     bounds: str
 
     def __post_init__(self) -> None:
-        if self.resampling not in RESAMPLERS:
-            raise ToftrackError(
-                f"filter.resampling={self.resampling} is unknown; give one of"
-                f" {', '.join(RESAMPLERS)}"
-            )
-        if self.bounds not in BOUNDS:
-            raise ToftrackError(
-                f"filter.bounds={self.bounds} is unknown; give {' or '.join(BOUNDS)}"
-            )
+        check_choice("filter.resampling", self.resampling, RESAMPLERS)
+        check_choice("filter.bounds", self.bounds, BOUNDS)
         for name in ("particles", "passes"):
             check_number(f"filter.{name}", getattr(self, name), 1, whole=True)
         for name in ("exponent", "exponent_growth", "shrink"):

@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 
 from toftrack.compute.compiling import entry_point
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_choice
 from toftrack.frames.estimate import Estimate
 from toftrack.gestures import features
 from toftrack.gestures.definitions import FIST, OTHER, RAY_GESTURES, SETS, Definition
@@ -203,8 +203,7 @@ def gestures_with(
     known: str, named: Sequence[NamedPose], settings: GestureSettings, source: str
 ) -> Gestures:
     """The known gestures and a user's poses, which are from `source`; as make_gestures."""
-    if known not in SETS:
-        raise ToftrackError(f"gestures.known={known} is unknown; give {' or '.join(SETS)}")
+    check_choice("gestures.known", known, SETS)
     taken = {pose.name for pose in named}
     if OTHER in taken:
         raise ToftrackError(

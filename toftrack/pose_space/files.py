@@ -15,7 +15,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from toftrack.configuration.plugins import installed, named_object
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_choice, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
 from toftrack.hand.skeleton import ANGLE_NAMES
@@ -178,11 +178,8 @@ def make_pose_space(
     data: what it is learned from: "natural" motion, or "synthetic", the paper's 79 poses.
     """
     if file is None:
-        if data not in _DATA:
-            raise ToftrackError(
-                f"pose_space.data={data} is unknown; give {' or '.join(_DATA)}, or a file of"
-                " toftrack train for others: pose_space.file=FILE"
-            )
+        remedy = ", or a file of toftrack train for others: pose_space.file=FILE"
+        check_choice("pose_space.data", data, _DATA, remedy)
         return fit_pose_space(kind, dims, _DATA[data](), **settings).to("cpu")
     space = load_pose_space(file, kind)
     wanted = kind_of_space(kind).kind

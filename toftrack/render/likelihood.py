@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from toftrack.compute.compiling import entry_point
-from toftrack.errors import ToftrackError, check_number
+from toftrack.errors import ToftrackError, check_choice, check_number
 from toftrack.hand.shape import HandShape
 from toftrack.render.scoring import Counts, Evidence, Scorer
 from toftrack.render.segmentation import Observation
@@ -104,10 +104,7 @@ class FMeasure(Likelihood):
     coverage: float
 
     def __post_init__(self) -> None:
-        if self.naming not in NAMINGS:
-            raise ToftrackError(
-                f"likelihood.naming={self.naming} is unknown; give one of {', '.join(NAMINGS)}"
-            )
+        check_choice("likelihood.naming", self.naming, NAMINGS)
         super().__post_init__()
         check_number("likelihood.beta", self.beta, 0, above=True)
         check_number("likelihood.residual_weight", self.residual_weight, 0, 1)
