@@ -179,5 +179,5 @@ def test_numbers_that_make_no_hand_are_refused(key: str, value: float, tmp_path:
         place, at = place[at], 0
     place[at] = value
     (tmp_path / "hand.json").write_text(json.dumps(content))
-    with pytest.raises(ToftrackError, match="hand.json is a damaged hand shape file: its numbers"):
+    with pytest.raises(ToftrackError, match="hand.json is a damaged hand shape file .its numbers"):
         HandShape.load(tmp_path / "hand.json")

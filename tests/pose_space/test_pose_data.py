@@ -435,7 +435,7 @@ def test_a_recording_is_thinned_to_poses_that_cover_it(recorded: Path) -> None:
     [
         ({"joints_mm": None}, "joints_mm"),
         ({"seq_len": np.array([1, 2, 3, 4])}, "10 frames together"),
-        ({"joints_mm": np.zeros((110, 5, 3, 3), np.float32)}, "not a file of recorded joints"),
+        ({"joints_mm": np.zeros((110, 5, 3, 3), np.float32)}, "joints_mm .110, 5, 3, 3., is_left"),
         ({"joints_mm": np.full((110, 5, 4, 3), np.nan, np.float32)}, "NaN"),
         ({"seq_name": np.array([{}] * 4, dtype=object)}, "pickled"),
     ],

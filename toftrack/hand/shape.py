@@ -30,6 +30,7 @@ DEFAULT_HAND_LENGTH_M = 0.190
 
 _FORMAT = "toftrack-hand-shape"
 _VERSION = 2
+_TENSORS = ("base_m", "base_frames", "bone_lengths_m")
 _BONE_M = 0.002, 0.25
 """Bones of a hand are longer, and they and the way from the wrist to a knuckle shorter."""
 
@@ -145,8 +146,7 @@ class HandShape:
 
     def to(self, *args: object, **kwargs: object) -> HandShape:
         """The same shape on another device or of another dtype, as `torch.Tensor.to`."""
-        names = ("base_m", "base_frames", "bone_lengths_m")
-        return replace(self, **{name: getattr(self, name).to(*args, **kwargs) for name in names})
+        return replace(self, **{name: getattr(self, name).to(*args, **kwargs) for name in _TENSORS})
 
     @cached_property
     def hand_length_m(self) -> float:
@@ -172,9 +172,7 @@ class HandShape:
             "version": _VERSION,
             "side": self.side,
             "thickness": self.thickness,
-            "base_m": self.base_m.tolist(),
-            "base_frames": self.base_frames.tolist(),
-            "bone_lengths_m": self.bone_lengths_m.tolist(),
+            **{name: getattr(self, name).tolist() for name in _TENSORS},
             "fitted": self.fitted and self.fitted.content(),
         }
         write_whole(path, json.dumps(content, indent=1) + "\n")
@@ -193,22 +191,19 @@ class HandShape:
                 f" reads version {_VERSION}; write it again with this version"
             )
         fitted = content.get("fitted")
-        names = ("base_m", "base_frames", "bone_lengths_m")
         expected = (KeyError, TypeError, ValueError, AttributeError, RuntimeError)
         with reported_errors(f"{path} is a damaged hand shape file", remedy, *expected):
             shape = HandShape(
-                **{name: torch.tensor(content[name], dtype=torch.float32) for name in names},
+                **{name: torch.tensor(content[name], dtype=torch.float32) for name in _TENSORS},
                 thickness=float(content["thickness"]),
                 side=str(content["side"]),
                 fitted=None if fitted is None else Fitted.of(fitted),
             )
-        sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
-        if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:
-            raise ToftrackError(f"{path} is a damaged hand shape file: sizes {sizes}, {shape.side}")
-        if not shape._sensible:
-            raise ToftrackError(
-                f"{path} is a damaged hand shape file: its numbers make no hand; {remedy}"
-            )
+            sizes = (shape.base_m.shape, shape.base_frames.shape, shape.bone_lengths_m.shape)
+            if sizes != ((5, 3), (5, 3, 3), (5, 3)) or shape.side not in SIDES:
+                raise ValueError(f"sizes {sizes}, {shape.side}")
+            if not shape._sensible:
+                raise ValueError("its numbers make no hand")
         return shape
 
     @property

@@ -122,13 +122,13 @@ def _read(path: str) -> tuple[np.ndarray, np.ndarray, list[str], list[int]]:
         left = np.asarray(content["is_left"], bool)
         names = [str(name) for name in content["seq_name"]]
         lengths = [int(length) for length in content["seq_len"]]
-    shapes = joints.ndim == 4 and joints.shape[1:] == (5, 4, 3) and left.shape == joints.shape[:1]
-    counted = len(names) == len(lengths) and joints.shape[:1] == (sum(lengths),)
-    if not shapes or not counted or min(lengths, default=0) < 1:
-        raise ToftrackError(
-            f"{path} is not a file of recorded joints: joints_mm {joints.shape}, is_left"
-            f" {left.shape}, {len(names)} clips of {sum(lengths)} frames together"
-        )
-    if not np.isfinite(joints).all():
-        raise ToftrackError(f"{path} has joint positions that are not numbers (NaN or infinite)")
+        shapes = joints.shape[1:] == (5, 4, 3) and left.shape == joints.shape[:1]
+        counted = len(names) == len(lengths) and joints.shape[:1] == (sum(lengths),)
+        if not shapes or not counted or min(lengths, default=0) < 1:
+            raise ValueError(
+                f"joints_mm {joints.shape}, is_left {left.shape}, {len(names)} clips of"
+                f" {sum(lengths)} frames together"
+            )
+        if not np.isfinite(joints).all():
+            raise ValueError("joint positions are NaN or infinite")
     return joints, left, [name.removesuffix(".json.lz") for name in names], lengths
