@@ -222,27 +222,29 @@ def test_images_of_a_pixel_s_width(back_end, size):
 INTERPRETED = [(16, 150, 8.0, "right"), (17, 65, 3.0, "left"), (1, 1, 0.0, "right")]
 
 
+def triton_agrees() -> None:
+    from toftrack.render.triton.scorer import TritonScorer
+
+    for *size, radius_px, side in INTERPRETED:
+        shape = default_hand_shape(side=side)
+        evidence = random_evidence(shape, *size, radius_px, 0.4, 1)
+        states = random_states(6, (0.3, 0.5), 1)
+        states[:3, :3] = torch.tensor([0.0, 0.08, 0.4])
+        states[:3, 3:] *= 0.1
+        aside = 0.4 * size[1] / size[0] / 3
+        states[1, 0], states[2, 0] = -aside, aside
+        states[4, 2], states[5, 7] = -0.4, math.nan
+        found = TritonScorer(shape)(states, evidence)
+        assert all(field[5] == 0 for field in found)
+        expected = ReferenceScorer(shape)(states[:5], evidence)
+        check(Counts(*(f[:5] for f in found)), expected)
+
+
 def test_triton_agrees_as_far_as_its_interpreter_goes():
     """The CUDA kernels, interpreted on the CPU in a process of its own."""
     pytest.importorskip("triton", reason="triton is not installed")
-    code = (
-        "import torch, sys; sys.path.insert(0, 'tests/render')\n"
-        "from test_scoring import *\n"
-        "from toftrack.render.triton.scorer import TritonScorer\n"
-        "for *size, radius_px, side in INTERPRETED:\n"
-        "    shape = default_hand_shape(side=side)\n"
-        "    evidence = random_evidence(shape, *size, radius_px, 0.4, 1)\n"
-        "    states = random_states(6, (0.3, 0.5), 1)\n"
-        "    states[:3, :3] = torch.tensor([0.0, 0.08, 0.4]); states[:3, 3:] *= 0.1\n"
-        "    aside = 0.4 * size[1] / size[0] / 3\n"
-        "    states[1, 0], states[2, 0] = -aside, aside\n"
-        "    states[4, 2] = -0.4\n"
-        "    states[5, 7] = math.nan\n"
-        "    found = TritonScorer(shape)(states, evidence)\n"
-        "    assert all(field[5] == 0 for field in found)\n"
-        "    expected = ReferenceScorer(shape)(states[:5], evidence)\n"
-        "    check(Counts(*(f[:5] for f in found)), expected)\n"
-    )
+    code = "import sys; sys.path.insert(0, 'tests/render')\n"
+    code += "from test_scoring import triton_agrees\ntriton_agrees()"
     env = {**os.environ, "TRITON_INTERPRET": "1"}
     run = subprocess.run([sys.executable, "-c", code], env=env, capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
@@ -336,10 +338,9 @@ def _count_missed(model, words, rows, reach, steps, wanted, buffer):
 
 def bits_of(mask: np.ndarray, words: int) -> np.ndarray:
     """(H, W) bool to (words, H) words of 64 pixels, the first in the lowest bit."""
-    padded = np.zeros((len(mask), 64 * words), np.uint64)
+    padded = np.zeros((len(mask), 64 * words), bool)
     padded[:, : mask.shape[1]] = mask
-    powers = np.uint64(1) << np.arange(64, dtype=np.uint64)
-    return (padded.reshape(len(mask), words, 64) * powers).sum(-1, dtype=np.uint64).T
+    return np.packbits(padded, 1, "little").view("<u8").T
 
 
 @pytest.mark.parametrize("radius_px", [0.0, 1.0, 2.5, 10.5, 40.0, 90.0])

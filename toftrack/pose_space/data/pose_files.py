@@ -237,18 +237,16 @@ def _read_run(place: Path) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         f"{place} cannot be read as the track.npz of a run", _RUN, OSError, ValueError
     ):
         content = read_archive(place, {"state", "lost", "confidence", "dropped"})
-    size = 6 + len(ANGLE_NAMES)
-    state, lost = (content.get(name, np.zeros(0)) for name in ("state", "lost"))
-    states = state.dtype.kind == "f" and state.ndim in (2, 3)
-    if not states or lost.dtype != bool or state.shape != (*lost.shape, size):
-        raise ToftrackError(
-            f"{place} is not the track.npz of a run: it has no states of {size} numbers; {_RUN}"
-        )
-    sure = content.get("confidence", np.ones(lost.shape))
-    # A dropped frame repeats the one before.
-    dropped = content.get("dropped", np.zeros(len(lost), bool))
-    if sure.shape != lost.shape or dropped.shape != lost.shape[:1]:
-        raise ToftrackError(f"{place} is damaged: its arrays are of different lengths")
+        size = 6 + len(ANGLE_NAMES)
+        state, lost = (content.get(name, np.zeros(0)) for name in ("state", "lost"))
+        states = state.dtype.kind == "f" and state.ndim in (2, 3)
+        if not states or lost.dtype != bool or state.shape != (*lost.shape, size):
+            raise ValueError(f"it has no states of {size} numbers")
+        sure = content.get("confidence", np.ones(lost.shape))
+        # A dropped frame repeats the one before.
+        dropped = content.get("dropped", np.zeros(len(lost), bool))
+        if sure.shape != lost.shape or dropped.shape != lost.shape[:1]:
+            raise ValueError("damaged: its arrays are of different lengths")
     usable = ~lost & ~dropped.astype(bool).reshape(-1, *[1] * (lost.ndim - 1))
     # The frames of a hand one after another: (T, slots, 27) to (slots * T, 27).
     hands = state.reshape(len(state), -1, size).swapaxes(0, 1)
