@@ -26,7 +26,6 @@ from toftrack.tracking.confidence import (
     JOINT_FEATURES,
     KIND_OF_JOINT,
     KINDS,
-    ConfidenceModel,
     JointConfidence,
 )
 from toftrack.tracking.model import TrackerModel
@@ -80,6 +79,9 @@ class Observed(NamedTuple):
 
 def fit_confidence(asked: argparse.Namespace) -> None:
     """Render, track, fit, report; asked: the arguments of fit-confidence."""
+    model = make_tracker(*asked.overrides).model
+    if not isinstance(model, TrackerModel):
+        raise ToftrackError("fit-confidence fits lost=calibrated; leave experiment=paper out")
     asked.output.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(asked.seed)
     bank = shape_bank(400, generator)
@@ -98,8 +100,7 @@ def fit_confidence(asked: argparse.Namespace) -> None:
     kept = seen.sequence % _HELD_OUT == 0
     log_odds, summary = _fitted_frames(seen, seen.right, kept)
     summary["whole"] = _fitted_frames(seen, seen.whole, kept)[1]
-    settings = _settings(asked.overrides)
-    seen = with_doubt(seen, log_odds, settings.memory)
+    seen = with_doubt(seen, log_odds, model.lost.memory)
     belief, more = _fitted_joints(seen, kept)
     summary |= more
     write_whole(asked.output / "summary.json", json.dumps(summary, indent=1) + "\n")
@@ -108,7 +109,8 @@ def fit_confidence(asked: argparse.Namespace) -> None:
         for part, of in (("every_joint", summary), ("whole", summary["whole"]))
     }
     # Scale and odds of the joints are not fitted on rendered sequences: they stay.
-    joints = replace(belief, scale=settings.joints.scale, odds=settings.joints.odds)
+    before = model.lost.joints
+    joints = replace(belief, scale=before.scale, odds=before.odds)
     content = json.dumps(fitted | {"joints": asdict(joints)}, indent=1)
     write_whole(asked.output / "confidence.json", content + "\n")
     picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
@@ -140,13 +142,6 @@ def _fitted_frames(
         "weights": fitted,
     }
     return log_odds, summary
-
-
-def _settings(overrides: list[str]) -> ConfidenceModel:
-    model = make_tracker(*overrides).model
-    if not isinstance(model, TrackerModel):
-        raise ToftrackError("fit-confidence fits lost=calibrated; leave experiment=paper out")
-    return model.lost
 
 
 def with_doubt(seen: Observed, log_odds: np.ndarray, memory: float) -> Observed:

@@ -161,7 +161,12 @@ def posed_hands(
         angles = own if angles is None else torch.where(free[:, None], own, angles)
     shape, surface = cupped(shape, surface, angles, bank.log_size[rows], dice)
     if bool(free.any()):
-        angles, parts = _holding(angles, shape, surface, size, free, dice)
+        some = (free & dice.chance(HOLDING, n)).nonzero()[:, 0]
+        angles, parts = angles.clone(), torch.zeros(n, PARTS_OF_A_THING, PART)
+        parts[..., 0] = -1
+        if len(some) > 0:
+            holding = rows_of(shape, surface, some)
+            angles[some], parts[some] = random_grasps(*holding, size[some], dice)
     if rotation is None or known is not None:
         raised = thumb_is_up(angles) & dice.chance(UPRIGHT_THUMBS, n)
         turned = random_rotations(n, dice, views)
@@ -202,28 +207,6 @@ def posed_hands(
         skins=random_skins(centres, axes, joints, bare, dice),
         parts=_carried(parts, rotation, mirror, shift),
     )
-
-
-def _holding(
-    angles: Tensor,
-    shape: HandShape,
-    surface: HandSurface,
-    size: Tensor,
-    free: Tensor,
-    dice: Dice,
-) -> tuple[Tensor, Tensor]:
-    """Poses (N, 21), some of the `free` (N,) of which hold a thing now, and what they hold
-    (N, Q, PART), in the hands' frames.
-    """
-    n = len(size)
-    angles = angles.clone()
-    some = (free & dice.chance(HOLDING, n)).nonzero()[:, 0]
-    shape, surface = rows_of(shape, surface, some)
-    parts = torch.zeros(n, PARTS_OF_A_THING, PART)
-    parts[..., 0] = -1
-    if len(some) > 0:
-        angles[some], parts[some] = random_grasps(shape, surface, size[some], dice)
-    return angles, parts
 
 
 def _carried(parts: Tensor, rotation: Tensor, mirror: Tensor, shift: Tensor) -> Tensor:
