@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
@@ -29,15 +30,9 @@ def levels(pace: Pace, took_s: Iterable[float]) -> list[int]:
     return found
 
 
-class Slow:
+def slow(step_s: float) -> Callable[[], float]:
     """A clock that goes on by so much each time that it is asked."""
-
-    def __init__(self, step_s: float) -> None:
-        self.now_s, self.step_s = 100.0, step_s
-
-    def __call__(self) -> float:
-        self.now_s += self.step_s
-        return self.now_s
+    return itertools.count(100.0, step_s).__next__
 
 
 def test_quality_falls_while_frames_are_late_and_rises_when_they_are_not() -> None:
@@ -129,7 +124,7 @@ def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
     scene, found = sample(), []
     for step_s in (0.001, 3.0):
         usual = make_tracker("hand.side=right")
-        tracker = Tracker(usual.model, clock=Slow(step_s))
+        tracker = Tracker(usual.model, clock=slow(step_s))
         estimates = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(5)]
         assert tracker.time.reduced == 0
         assert estimates[-1].compute_s >= step_s
@@ -140,7 +135,7 @@ def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
 @pytest.mark.parametrize("hands", [1, 2])
 def test_a_slow_machine_still_tracks_with_less_quality(hands: int) -> None:
     usual = build_hands_tracker(configuration(f"hands={hands}", "tracker.budget_ms=33"))
-    usual.time = Timekeeper(usual.time.pace, Slow(0.06))
+    usual.time = Timekeeper(usual.time.pace, slow(0.06))
     scene = sample()
     for i in range(12):
         first, *_ = usual.step(scene.depth_m[i], scene.k, i, i / 25)

@@ -176,7 +176,6 @@ def test_a_left_hand_is_the_mirror_image_of_a_right_one() -> None:
     mirror = torch.tensor([-1.0, 1.0, 1.0])
     assert torch.allclose(right.joints_m * mirror, left.joints_m, atol=1e-6)
     assert torch.allclose(right.centres_m * mirror, left.centres_m, atol=1e-6)
-    k = intrinsics(180.0, HEIGHT, WIDTH)
-    one, two = (clean_picture(alone(hand), k, HEIGHT, WIDTH)[0][0] for hand in (right, left))
+    one, two = (clean_picture(alone(hand), K, HEIGHT, WIDTH)[0][0] for hand in (right, left))
     assert (np.abs(one[:, ::-1] - two) < 1e-4).mean() > 0.999
     assert (one[one > 0] < FARTHEST_M).all()
