@@ -243,7 +243,7 @@ def test_a_bad_model_file_is_one_clear_error(tmp_path, header, arrays, part) -> 
 
 
 def test_a_file_that_is_missing_or_no_archive_is_one_clear_error(tmp_path) -> None:
-    with pytest.raises(ToftrackError, match="no pose-space file.*toftrack train"):
+    with pytest.raises(ToftrackError, match="nothing.npz is not a pose-space .*toftrack train"):
         load_pose_space(tmp_path / "nothing.npz")
     (tmp_path / "text.npz").write_text("hello")
     with pytest.raises(ToftrackError, match="not a pose-space file .it is no .npz"):

@@ -111,7 +111,8 @@ def test_three_quarters_of_the_hands_have_a_skin_and_sleeves_stay_outside_of_it(
     assert (posed.skins.covered[:, :29] == skinned[:, None]).all()
     arms = posed.skins.covered[:, 29:] & (posed.labels[:, 29:] == FOREARM)
     assert 0.3 < float(arms[skinned][:, :5].all(1).float().mean()) < 0.8
-    assert (posed.skins.blend_m >= 0.0015).all() and (posed.skins.blend_m <= 0.005).all()
+    blend = posed.skins.widths_m[:, 0]
+    assert (blend >= 0.0015).all() and (blend <= 0.005).all()
 
 
 def test_last_bones_are_as_long_as_people_s() -> None:

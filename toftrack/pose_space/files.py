@@ -151,10 +151,7 @@ def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Header and arrays of a file of this format and version."""
     what = f"{path} is not a pose-space file"
     with reported_errors(what, _ADVICE, OSError, ValueError, KeyError):
-        try:
-            content = read_archive(path)
-        except FileNotFoundError:
-            raise ToftrackError(f"no pose-space file at {path}; {_ADVICE}") from None
+        content = read_archive(path)
         header = parse_json(str(content.pop("header")))
         if not isinstance(header, dict) or header.get("format") != FORMAT:
             raise ValueError("its header is another")

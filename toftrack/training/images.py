@@ -348,7 +348,6 @@ def random_scenes(
     parts = second.parts.clone()
     parts[..., 0] = torch.where(there[:, None], parts[..., 0], -1.0)
     skins = hands.skins, second.skins
-    widths = [torch.stack((skin.blend_m, skin.outside_m), 1) for skin in skins]
     return Scenes(
         torch.cat(centres, 1),
         torch.cat(axes, 1),
@@ -357,7 +356,7 @@ def random_scenes(
         torch.cat((covered, plain), 1),
         torch.stack([skin.primitives for skin in skins], 1),
         torch.stack((skins[0].labels(labels), skins[1].labels(other_labels)), 1),
-        torch.stack(widths, 1),
+        torch.stack([skin.widths_m for skin in skins], 1),
         torch.cat((hands.parts, parts), 1),
     )
 

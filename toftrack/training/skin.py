@@ -37,16 +37,15 @@ class Skins:
     source: (P,) the ellipsoid of the hand whose label a primitive takes.
     covered: (N, E) ellipsoids of the hand and its forearm that the skin is drawn instead of.
     used: (N, P) primitives that are drawn where their source is.
-    blend_m: (N,) by how much surfaces grow where they join.
-    outside_m: (N,) how far the skin lies outside of the union.
+    widths_m: (N, 2) by how much surfaces grow where they join, and how far the skin lies outside of
+        the union.
     """
 
     primitives: Tensor
     source: Tensor
     covered: Tensor
     used: Tensor
-    blend_m: Tensor
-    outside_m: Tensor
+    widths_m: Tensor
 
     def labels(self, labels: Tensor) -> Tensor:
         """(N, P) of the primitives, -1 = not drawn, from those of the hand's ellipsoids (N, E)."""
@@ -79,7 +78,8 @@ def random_skins(
     # The cones hold the knuckles already, so that they are only drawn where they are thick.
     used[:, -len(knuckles) :] = dice.chance(0.3, n, 1)
     covered = bare & dice.chance(SKIN_SHARE, n, 1)
-    return Skins(torch.cat(primitives, 1), source, covered, used, blend, outside)
+    widths = torch.stack((blend, outside), 1)
+    return Skins(torch.cat(primitives, 1), source, covered, used, widths)
 
 
 def _cones(centres: Tensor, axes: Tensor, size: Tensor, joints: Tensor, dice: Dice) -> Tensor:
