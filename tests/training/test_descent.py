@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -31,17 +30,6 @@ from toftrack.training.shapes import ShapeBank
 
 TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
 train_poses, train_finder = partial(train_network, PoseNet), partial(train_network, Finder)
-
-
-@pytest.fixture
-def folders(tmp_path: Path) -> Callable[[str], Path]:
-    """New ones, by their names."""
-
-    def made(name: str) -> Path:
-        (tmp_path / name).mkdir()
-        return tmp_path / name
-
-    return made
 
 
 def same(one: torch.nn.Module, two: torch.nn.Module) -> None:
@@ -204,9 +192,10 @@ class SwitchedOffError(Exception):
 @pytest.mark.slow
 @pytest.mark.parametrize("train", [train_poses, train_finder])
 def test_a_training_that_was_interrupted_twice_ends_with_the_same_weights(
-    train, folders: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    train, tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Before its restart and in it."""
+    folders = tmp_path_factory.mktemp
     schedule = replace(TINY, restart_images=24)
     whole, course = train(schedule, 6, 0, Checkpoints(folders("whole"), 1e-9))
     part = Checkpoints(folders("part"), 1e-9)
@@ -245,8 +234,9 @@ def interrupted(
 
 @pytest.mark.slow
 def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
-    folders: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    folders = tmp_path_factory.mktemp
     monkeypatch.setattr(descent, "_WARM", 1)
     more_images = replace(TINY, images=48)
     whole, _ = train_finder(more_images, 6, 0)

@@ -64,7 +64,8 @@ class Muon(torch.optim.Optimizer):
 
     def _inner(self, weight: Tensor, gradient: Tensor) -> Tensor:
         average = self._kept(weight, "exp_avg").lerp_(gradient, 1 - _MOMENTUM)
-        return _along(gradient.lerp(average, _MOMENTUM))
+        matrix = orthogonal(gradient.lerp(average, _MOMENTUM).flatten(1))
+        return matrix.view_as(gradient) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
 
     def _adam(self, weight: Tensor, gradient: Tensor, count: Tensor) -> Tensor:
         mean = self._kept(weight, "exp_avg").lerp_(gradient, 1 - _BETAS[0])
@@ -88,11 +89,6 @@ def half_precision(device: torch.device) -> torch.dtype:
     """
     fast = device.type != "cpu" or get_host_cpu_features().get("avx512bf16", False)
     return torch.bfloat16 if fast else torch.float32
-
-
-def _along(gradient: Tensor) -> Tensor:
-    matrix = orthogonal(gradient.flatten(1))
-    return matrix.view_as(gradient) * (_ADAM_SIZE * math.sqrt(max(matrix.shape)))
 
 
 def orthogonal(matrix: Tensor) -> Tensor:
