@@ -26,6 +26,8 @@ WRONG = [
     ("filter.particles=10000000", "filter.particles=10000000 is not possible"),
     ("filter.exponent=nan", "filter.exponent=nan is not possible; give a number"),
     ("device.repeat=5", "device.repeat=5 is not possible; give true or false"),
+    ("device=sr3000 device.fps=-1", "device.fps=-1 is not possible; give a number above 0"),
+    ("device=realsense device.fps=0", "device.fps=0 is not possible; give a whole number above 0"),
     ("hands=9", "hands=9 is not possible; give a whole number above 0 and at most 8"),
     (f"seed={10**23}", "is not possible"),
     ("seed=" + "[" * 3000 + "]" * 3000, ""),

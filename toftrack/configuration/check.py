@@ -3,8 +3,8 @@
 Each value is compared with the one in conf/ that it takes the place of: where that is a number, so
 must be the override, whole where it is whole, and not negative, as hardly a number in conf/ is.
 Which settings must be above 0, and which may be below, stands here; other bounds are for the parts
-that use the settings, as are most of devices, which come before torch anyway. Only toftrack's own
-parts are looked at: what a part of somebody else's accepts, nobody knows.
+that use the settings. Only toftrack's own parts are looked at: what a part of somebody else's
+accepts, nobody knows.
 """
 
 from __future__ import annotations
@@ -28,7 +28,11 @@ from toftrack.errors import MOST_HANDS, ToftrackError, check_number
 _ABOVE_ZERO = frozenset(
     """
     data.poses data.worst_fit_mm
-    device.height device.width
+    device.fps device.frames device.height device.queue_frames device.timeout_s device.width
+    device.emulated.unit_m device.libmesasr.timeout_ms
+    device.persistence.backoff_s device.persistence.first_frame_s device.persistence.give_up_s
+    device.persistence.longest_backoff_s device.persistence.reopen_after
+    device.usb.drain_ms device.usb.read_multiple device.usb.timeout_ms
     filter.exponent filter.exponent_growth filter.particles filter.passes filter.shrink
     gestures.off_rad gestures.other gestures.pinch.open
     hands
