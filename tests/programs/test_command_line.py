@@ -262,6 +262,18 @@ def test_a_log_on_a_full_disk_ends_no_run(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
 
 
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+def test_a_run_whose_log_nobody_reads_on_keeps_its_results(unbuffered: str, tmp_path: Path) -> None:
+    words = f"track view=none device.stop=2 experiment=paper hydra.run.dir={tmp_path}"
+    subprocess.run(
+        f"{sys.executable} -m toftrack {words} 2>&1 | head -n 1",
+        env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+        shell=True,
+        check=True,
+    )
+    assert json.loads((tmp_path / "summary.json").read_text())["frames"] in (0, 1, 2)
+
+
 @pytest.mark.parametrize(("closed", "status"), [("0<&-", 0), ("2>&-", 0), ("1>&-", 1)])
 def test_a_program_runs_with_closed_streams_but_streams_to_none(
     closed: str, status: int, tmp_path: Path

@@ -19,13 +19,15 @@ from typing import Any
 
 class _Log(io.FileIO):
     """Standard error: what finds no room, as in a file on a full disk, is left out, and ends
-    nothing that goes on for weeks.
+    nothing that goes on for weeks; that nobody reads on is an error once.
     """
 
     def write(self, data: Any) -> int:
         try:
             return super().write(data)
         except OSError as error:
+            if error.errno == errno.EPIPE:  # files that are finished then may say something, too
+                os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
             if error.errno not in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None)):
                 raise
             return memoryview(data).nbytes
@@ -40,8 +42,11 @@ for stream in (sys.stdin, sys.stdout, sys.stderr):
     if stream is None:  # closed: else the next file that is opened takes its descriptor
         os.open(os.devnull, os.O_RDWR)
 if (own := sys.__stderr__) is not None and sys.stderr is own:
-    room = io.BufferedWriter(_Log(own.fileno(), "w", closefd=False))
-    sys.stderr = io.TextIOWrapper(room, own.encoding, own.errors, line_buffering=True)
+    buffer: Any = own.buffer  # with python -u there is none
+    if isinstance(getattr(buffer, "raw", buffer), io.FileIO):  # Windows's console has its own kind
+        log = _Log(own.fileno(), "w", closefd=False)
+        room = io.BufferedWriter(log) if hasattr(buffer, "raw") else log
+        sys.stderr = io.TextIOWrapper(room, own.encoding, own.errors, line_buffering=True)
 for stream in (sys.stdout, sys.stderr):
     # A file's name may have what an encoding lacks; what is no text in it passes through UTF-8.
     if isinstance(stream, io.TextIOWrapper) and (
