@@ -162,6 +162,13 @@ def test_an_installed_package_brings_every_kind(package: Path) -> None:
         toftrack.make_tracker("pose_space=theirs", "pose_space.iteration=4")
 
 
+def test_an_installed_reader_may_compute_its_camera(package: Path) -> None:
+    file = package / "site" / "my_reader.py"
+    code = file.read_text().replace("self.camera =", "self.own =")
+    file.write_text(code + "\n    camera = property(lambda self: self.own)\n")
+    assert Replay(package / "images.raw16").camera.width == 176
+
+
 def test_an_installed_part_stands_behind_toftracks_own(package: Path) -> None:
     entry = package / "site" / "mine-1.0.dist-info" / "entry_points.txt"
     entry.write_text("[toftrack.pose_spaces]\npca = nowhere:Thing\nlate = nowhere:Thing\n")

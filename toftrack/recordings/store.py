@@ -71,7 +71,8 @@ def open_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> FrameStore
     """
     store = open_with_own_camera(path, given)
     size = store.camera.width, store.camera.height
-    store.camera = given.camera(*size, f"'{path}'") or store.camera
+    if lens := given.camera(*size, f"'{path}'"):  # somebody's reader may compute its own
+        store.camera = lens
     return store
 
 
