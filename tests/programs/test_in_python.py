@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from helpers.tracking import Camera, run, sample
 
 import toftrack
 from toftrack.devices.replay import Sample
+from toftrack.programs import in_python
 from toftrack.programs.recover import recover
 from toftrack.recordings.npz import read_recording
 
@@ -126,6 +128,25 @@ def test_a_program_that_ends_within_the_loop_ends_and_keeps_its_recording(tmp_pa
         finally:
             process.kill()
     assert len(read_recording(tmp_path / "kept.npz")) == 1
+
+
+def test_loops_that_are_left_open_are_all_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = []
+
+    def loop(number: int) -> Iterator[None]:
+        try:
+            yield
+        finally:
+            closed.append(number)
+            raise toftrack.ToftrackError("no room for its video")
+
+    loops = [loop(number) for number in range(2)]
+    for one in loops:
+        next(one)
+    monkeypatch.setattr(in_python, "_left_open", loops)
+    with pytest.raises(toftrack.ToftrackError, match="no room"):
+        in_python._close_loops()
+    assert sorted(closed) == [0, 1]
 
 
 def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:

@@ -45,9 +45,11 @@ _left_open: WeakSet[_Tracked] = WeakSet()
 @atexit.register
 def _close_loops() -> None:
     """Close them while there still are the threads that servers and recorders wait for."""
-    for frames in tuple(_left_open):
-        with suppress(RuntimeError, ValueError):  # no new thread any more; one that is in it
-            frames.close()
+    with ExitStack() as stack:  # all of them, also where one cannot finish its files
+        for frames in tuple(_left_open):
+            # No new thread any more; one that is in it.
+            stack.enter_context(suppress(RuntimeError, ValueError))
+            stack.callback(frames.close)
 
 
 def track(
