@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -62,7 +63,7 @@ class View:
     results are written, so it may stay.
     """
 
-    def __init__(self, *_: Any, **__: Any) -> None: ...
+    def __init__(self, folder: Path, fps: float, frames: int | None) -> None: ...
 
     def show(self, tracked: TrackedFrame) -> None:
         """Take one frame; raises ToftrackError when it cannot be kept."""
