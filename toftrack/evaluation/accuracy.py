@@ -1,13 +1,13 @@
 """How accurate the tracker is on recordings with truth: `toftrack benchmark accuracy FOLDER...`.
 
-Tracks every recording (.npz) that has truth with every seed and prints one table: per recording and
-in total, with 90 % intervals over recordings, then by sensor, pose, distance and hand length.
+Tracks every recording (.npz) that has truth with every seed and prints tables: per recording and in
+total, with 90 % intervals over recordings, then by sensor, pose, distance and hand length.
 toftrack/evaluation/trust.py, measures.py and rows.py say what each figure is. With --labels, images
 that were labelled by eye are measured, too (toftrack/evaluation/image_labels.py).
 
---compare FILE takes the difference to an earlier measurement, paired by recording and seed: the
-gate for a change of the tracker. A * marks intervals that do not hold 0, of five recordings and
-more.
+--compare FILE shows the difference from an earlier measurement, paired by recording and seed: the
+test that a change of the tracker must pass. With five recordings or more, a * marks intervals that
+do not include 0.
 
 --peer mediapipe measures MediaPipe Hands on the amplitude images, lifted to metres by the depth
 (peer_mediapipe.py says how), with the same measures, and times it in turn with the tracker.
@@ -29,11 +29,11 @@ from toftrack.evaluation.rows import Row
 from toftrack.evaluation.runs import jobs, run_jobs, sources
 from toftrack.evaluation.statistics import text_of
 
-ABLATION = """What each part of the tracker brings: `toftrack benchmark ablation FOLDER...`.
+ABLATION = """What each part of the tracker contributes: `toftrack benchmark ablation FOLDER...`.
 
 Tracks recordings with truth as the default does, and again with one part changed or left out, with
 the same seeds; differences are paired by recording and seed, with 90 % intervals over recordings.
-A * marks intervals that do not hold 0, of five recordings and more.
+With five recordings or more, a * marks intervals that do not include 0.
 """
 
 

@@ -1,10 +1,10 @@
-"""How long frames and starts take: programs in turn, so that all meet what else a machine does.
+"""How long frames and starts take, with programs in turn, so that a machine's load affects all.
 
 Every program has a process of its own and sees the packaged recording forwards and backwards, one
-program after another, as often as --rounds says. With --peer-python, MediaPipe Hands is one of
-them, as its accuracy is compared (two hands are looked for) and looking for one. --two-hands names
-recordings with truth in which two hands are tracked, beside one of them. --starts runs the command
-line on three frames, each time without any compiled kernels, and then with them.
+program after another, as often as --rounds says. With --peer-python, MediaPipe Hands is among them
+twice: looking for two hands, as where its accuracy is compared, and looking for one. --two-hands
+names recordings with truth in which two hands are tracked, and also one of them alone. --starts
+runs the command line on three frames, each time without any compiled kernels, and then with them.
 """
 
 from __future__ import annotations

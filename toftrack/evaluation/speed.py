@@ -1,8 +1,8 @@
 """How fast hypotheses are scored, frames tracked and latents decoded: `toftrack benchmark speed`.
 
-All methods of a table are timed in turn within one process, so that what else the machine does hits
-all of them alike. The hypotheses are spread around the true wrist of the packaged recording's first
-frame, cropped around the hand. The baselines, on few particles only:
+All methods of a table are timed in turn within one process, so that what else the machine does
+affects all of them alike. The hypotheses are spread around the true wrist of the packaged
+recording's first frame, cropped around the hand. The baselines are timed on few particles only:
 
 * stepping: the paper's own way (section 2.2), rays stepped in 5 mm to the quadric's crossing;
 * naive: the closed form over whole images of all ellipsoids (ReferenceScorer).

@@ -22,11 +22,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     kinds = {"alternating": _alternating, "accuracy": _accuracy, "ablation": _ablation}
     if given[:1] in (["-h"], ["--help"]):
         print(
-            "usage: toftrack benchmark [speed] ...       how fast hypotheses and frames are\n"
-            "       toftrack benchmark alternating ...   frames, in turn with MediaPipe's; starts\n"
-            "       toftrack benchmark accuracy ...      how accurate, on recordings with truth\n"
-            "       toftrack benchmark ablation ...      what each part of the tracker brings\n\n"
-            "toftrack benchmark speed --help and so on say more"
+            "usage: toftrack benchmark [speed] ...       time of hypotheses and frames\n"
+            "       toftrack benchmark alternating ...   frames in turn with MediaPipe's; starts\n"
+            "       toftrack benchmark accuracy ...      accuracy on recordings with truth\n"
+            "       toftrack benchmark ablation ...      what each part of the tracker adds\n\n"
+            "toftrack benchmark speed --help, and so on, says more"
         )
     elif given and given[0] in kinds:
         kinds[given[0]](given[1:])
@@ -60,11 +60,13 @@ def _alternating(arguments: Sequence[str]) -> None:
     from toftrack.evaluation import alternating, results
 
     parser = plain_parser("toftrack benchmark alternating", alternating.__doc__)
-    parser.add_argument("--rounds", type=int, default=5, help="of all programs (5); 0 = none")
-    parser.add_argument("--starts", type=int, default=0, help="of the command line (0)")
-    parser.add_argument("--cores", type=int, help="as many as all may use, where that can be set")
+    parser.add_argument(
+        "--rounds", type=int, default=5, help="rounds of all programs (5); 0 = none"
+    )
+    parser.add_argument("--starts", type=int, default=0, help="starts to time (0)")
+    parser.add_argument("--cores", type=int, help="how many all may use, if it can be set")
     parser.add_argument("--two-hands", nargs="+", default=[], metavar="RECORDING")
-    parser.add_argument("--peer-python", metavar="PYTHON", help="MediaPipe's")
+    parser.add_argument("--peer-python", metavar="PYTHON", help="Python of MediaPipe's environment")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     given = parser.parse_args(arguments)
     if min(given.rounds, given.starts) < 0 or (given.cores or 1) < 1:
@@ -83,16 +85,18 @@ def _accuracy(arguments: Sequence[str]) -> None:
     from toftrack.evaluation.runs import SIDES
 
     parser = _parser_of_recordings("accuracy", accuracy.__doc__)
-    about = "handedness: told, by the truth, or auto, detected while tracking (told)"
+    about = "handedness: told = given by the truth, auto = detected while tracking (told)"
     parser.add_argument("--side", choices=SIDES, default="told", help=about)
     hands = range(1, MOST_HANDS + 1)
     parser.add_argument("--hands", type=int, choices=hands, default=1, help="followed at once (1)")
-    about = "of a recording without truth; may be given several times"
+    about = "labels of a recording without truth; may be given several times"
     add = parser.add_argument
     add("--labels", type=Path, metavar="FILE", action="append", default=[], help=about)
-    parser.add_argument("--compare", type=Path, metavar="FILE", help="an earlier --json")
+    parser.add_argument("--compare", type=Path, metavar="FILE", help="file of an earlier --json")
     parser.add_argument("--peer", choices=(PEER,), help="measure another method, too")
-    parser.add_argument("--peer-python", type=Path, metavar="PYTHON", help="of its environment")
+    parser.add_argument(
+        "--peer-python", type=Path, metavar="PYTHON", help="Python of its environment"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
     command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
     accuracy.measure(_options(parser, arguments), command, _write_picture)
@@ -123,11 +127,11 @@ def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentPars
     parser = plain_parser(f"toftrack benchmark {name}", about)
     about = "folders of recordings, or recordings; KEY=VALUE is an override as for track.py"
     parser.add_argument("what", nargs="+", metavar="FOLDER", help=about)
-    parser.add_argument("--seeds", type=_seeds, default=[0], help="separated by commas (0)")
+    parser.add_argument("--seeds", type=_seeds, default=[0], help="seeds, separated by commas (0)")
     parser.add_argument("--config-dir", help="folder of choices of your own (docs/extending.md)")
-    about = "processes (1); figures stay"
+    about = "processes (1); does not change the figures"
     parser.add_argument("--workers", type=_workers, default=1, metavar="N", help=about)
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write everything there")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write all results there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
     return parser
 

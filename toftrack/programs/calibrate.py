@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("--report", help="folder of report and pictures (default: beside OUT)")
     add("--camera", help="camera file to start from instead of the recording's")
     add("--keep-lens", action="store_true", help="correct the depth only, trust the lens")
-    add("--frames", type=int, default=80, help="frames to use, at most (80)")
+    add("--frames", type=int, default=80, help="use at most this many (80)")
     mhz, about = DEFAULT_MODULATION_MHZ, "MHz, of a .srs that does not state its range"
     add("--modulation", type=int, default=mhz, help=about)
     options = parser.parse_args(arguments)

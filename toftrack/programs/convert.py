@@ -43,17 +43,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("source", metavar="IN", help="the recording to read")
     add("target", metavar="OUT", help=".srs, .npz, or a folder")
     add("--camera", help="camera file instead of the recording's own camera")
-    about = "MHz of the SR3000: the range of a .srs, read (if it states none) or written"
+    about = "MHz of the SR3000: gives the range of a .srs, of IN (if it states none) or of OUT"
     add("--modulation", type=int, default=DEFAULT_MODULATION_MHZ, help=about)
-    add("--unit", type=float, help="metres of one step of the PNG images")
+    add("--unit", type=float, help="metres of one step of the PNG images to write")
     add("--overwrite", action="store_true", help="replace an existing file")
-    add("--topic", help="of the depth images in a ROS bag that has several")
+    add("--topic", help="topic of the depth images in a ROS bag that has several")
     names = ("FX", "FY", "CX", "CY")
     about = "pixels: a lens without distortion, instead of the recording's own"
     add("--intrinsics", type=float, nargs=4, metavar=names, help=about)
     add("--source-unit", type=float, help="metres of one step of IN's whole numbers (0.001)")
-    add("--fps", type=float, help="frames a second of images without times (25)")
-    add("--dataset", help="the depth stack in a .h5 or .mat that has several")
+    add("--fps", type=float, help="frames per second of images without times (25)")
+    add("--dataset", help="name of the depth stack in a .h5 or .mat that has several")
     options = parser.parse_args(arguments)
     lens = None if options.intrinsics is None else tuple(options.intrinsics)
     given = Given(

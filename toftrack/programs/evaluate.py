@@ -22,12 +22,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add = parser.add_argument
     add("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
     add("folder", metavar="FOLDER", help="where the data set lies")
-    about = "as for track.py, filter.particles=1000"
+    about = "a setting as for track.py, filter.particles=1000"
     add("overrides", metavar="OVERRIDE", nargs="*", default=[], help=about)
     add("--config-dir", help="folder of choices of your own (docs/extending.md)")
-    add("--sequences", help="only those, by name, separated by commas: P0/1,P0/2")
-    add("--frames", type=_count, help="only so many at the start of each sequence")
-    about = "how far the labels' fingertips lie inside of ours, instead of the data set's own"
+    add("--sequences", help="only these, by name, separated by commas: P0/1,P0/2")
+    add("--frames", type=_count, help="only this many at the start of each sequence")
+    about = "how far the labels' fingertips lie inside ours, instead of what the data set gives"
     add("--tip-inset", type=float, metavar="MM", help=about)
     add("--json", type=Path, metavar="FILE", help="write the figures here, too")
     options = parser.parse_intermixed_args(arguments)

@@ -2,8 +2,8 @@
 
 glb: an animated hand with a skin, for Blender, Unity, Godot and web pages (needs the extra export).
 bvh: its skeleton's motion in centimetres and degrees, x right, y up, z backward, for animation
-programs; the hand is as large as hand_shape.json says, and held where it is lost. csv: a flat
-table, for spreadsheets. The file goes into RUN.
+programs; the hand has the size that hand_shape.json gives, and keeps its pose while lost. csv: a
+flat table, for spreadsheets. The file goes into RUN.
 """
 
 from __future__ import annotations

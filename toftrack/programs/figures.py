@@ -8,11 +8,11 @@ Writes five PNG files into the run's folder, below `figures`:
 | `filmstrip.png` | ten frames with the skeleton, and the estimates' range images (fig. 5) |
 | `lost.png` | frames that were lost, else those of the lowest score, with their scores (fig. 6) |
 | `course.png` | joint error against the truth, score and confidence over time |
-| `latent.png` | the way of the estimates over the training poses |
+| `latent.png` | the path of the estimates over the training poses |
 
-The first three need the recording that the run tracked; of a run with a live camera there is none,
-and only the others are drawn. With several hands those of the second slot are `measurement_2`
-and so on; the filmstrip shows all.
+The first three need the recording that the run tracked; a run with a live camera has none, so only
+the others are drawn. With several hands, the figures of the second slot are `measurement_2` and so
+on; the filmstrip shows all hands.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = plain_parser("toftrack figures", __doc__)
     parser.add_argument("run", metavar="RUN_DIR", help="the output folder of track.py")
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
-    parser.add_argument("--out", metavar="DIR", help="instead of RUN_DIR/figures")
-    about = "of measurement.png; default one of median score"
+    parser.add_argument("--out", metavar="DIR", help="write here instead of RUN_DIR/figures")
+    about = "the frame of measurement.png (default: one with the median score)"
     parser.add_argument("--frame", type=int, metavar="N", help=about)
     options = parser.parse_args(arguments)
     for path in draw_figures(options.run, options.recording, options.out, options.frame):

@@ -41,12 +41,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     option = parser.add_argument
     option("command", choices=("add", "list", "remove"))
-    about = "its name; the recording that shows it (or sample); as for track.py, hand.side=left"
+    about = "its name; the recording that shows it (or sample); settings, as hand.side=left"
     option("words", nargs="*", default=[], metavar="NAME RECORDING OVERRIDE", help=about)
-    option("--from", dest="begin", type=float, metavar="S", help="seconds")
-    option("--to", dest="end", type=float, metavar="S", help="seconds")
+    option("--from", dest="begin", type=float, metavar="S", help="where it begins, s")
+    option("--to", dest="end", type=float, metavar="S", help="where it ends, s")
     option("--file", default=_FILE, help=f"the file of gestures ({_FILE})")
-    option("--replace", action="store_true", help="in place of one of that name")
+    option("--replace", action="store_true", help="replace a gesture of that name")
     options = parser.parse_intermixed_args(arguments)
     path = Path(options.file).expanduser()
     if path.suffix.lower() != ".json":

@@ -1,11 +1,11 @@
 """Label a recording by eye and measure the tracker on it: `toftrack label FILE`.
 
-Opens a page that shows frames, evenly spaced, and asks for fingertips, knuckles and wrist by a
-click each, for gesture and side. Every click is kept at once; the same command goes on later, until
-Ctrl-C. `toftrack benchmark accuracy FILE --labels labels.json` reads what comes of it.
+Opens a page that shows evenly spaced frames and asks for a click on each fingertip, each knuckle
+and the wrist, and for gesture and side. Every click is saved at once. Ctrl-C ends; the same command
+continues later. `toftrack benchmark accuracy FILE --labels labels.json` measures on the labels.
 
 FILE is any recording, as for `toftrack track`. --least-sure tracks it first and shows the frames in
-which the tracker is least sure: where it errs, not how often.
+which the tracker is least sure: these tell where it errs, not how often.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
     parser = plain_parser("toftrack label", __doc__)
     add = parser.add_argument
-    about = "the recording, and settings KEY=VALUE of it, as for toftrack track"
+    about = "the recording, and KEY=VALUE settings for it, as for toftrack track"
     add("words", nargs="*", default=[], metavar="FILE", help=about)
-    add("--frames", type=int, help=f"how many ({_FRAMES}, or those in the output)")
-    add("--least-sure", action="store_true", help="where the tracker is least sure")
-    add("--output", default="labels.json", help="the file (labels.json)")
-    add("--side", choices=("right", "left"), help="whose hand; the page asks, too")
-    add("--port", type=int, default=0, help="of the page (any free one)")
+    add("--frames", type=int, help=f"how many to label ({_FRAMES}, or those in the output)")
+    add("--least-sure", action="store_true", help="show the frames where the tracker is least sure")
+    add("--output", default="labels.json", help="the file to write (labels.json)")
+    add("--side", choices=("right", "left"), help="which hand it is; the page asks, too")
+    add("--port", type=int, default=0, help="port of the page (any free one)")
     add("--no-browser", action="store_true", help="only print the address")
     options = parser.parse_intermixed_args(arguments)
     if options.frames is not None:

@@ -33,7 +33,7 @@ _HELP = ("-h", "--help")
 _VERSION = "--version"
 
 _EXAMPLES = """
-  toftrack track                              the recording that comes with it
+  toftrack track                              the recording that comes with toftrack
   toftrack track FILE hand.side=left          a recording of your own, of a left hand
   toftrack track device=realsense view=browser    a camera, live in the browser
 """
@@ -45,10 +45,10 @@ commands (toftrack COMMAND --help says more):
 
 _TRACK = f"""toftrack track follows a hand and writes joints, state and gesture of every frame.
 {_EXAMPLES}
-FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or what
-docs/cameras.md names. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
-Ctrl-C ends a run and keeps what was done. Everything else are settings: KEY=VALUE, or
-GROUP=CHOICE of
+FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or another
+kind in docs/cameras.md. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
+Ctrl-C ends a run and keeps what was done. All other words are settings: KEY=VALUE, or
+GROUP=CHOICE from
 
 {{groups}}
 
@@ -56,7 +56,7 @@ GROUP=CHOICE of
   toftrack track -m seed=1,2,3 view=none      a sweep: one run after another
   toftrack track --hydra-help                 further options
 
-The settings stand in {{folder}}, each with what it does."""
+The files in {{folder}} list all settings and say what each does."""
 
 _TRAIN = """toftrack train learns the space of hand poses that the tracker searches.
 
@@ -65,14 +65,15 @@ _TRAIN = """toftrack train learns the space of hand poses that the tracker searc
   toftrack train data=run data.path=RUN       from the poses of a run, outputs/DATE/TIME
 
 The model goes into the folder that is named at the end, or where hydra.run.dir=DIR says; use it
-with toftrack track pose_space=KIND pose_space.file=FILE. Settings are KEY=VALUE, or GROUP=CHOICE of
+with toftrack track pose_space=KIND pose_space.file=FILE. All other words are settings: KEY=VALUE,
+or GROUP=CHOICE from
 
 {groups}
 
   toftrack train --cfg job                    all settings, composed
   toftrack train --hydra-help                 further options
 
-The settings stand in {folder}, each with what it does."""
+The files in {folder} list all settings and say what each does."""
 
 _LONG_HELP = {"track": _TRACK, "train": _TRAIN}
 _GROUPS_OF_TRAINING = ("data", "pose_space")

@@ -1,9 +1,9 @@
 """Record a camera: `toftrack record OUT.npz device=realsense`, until Ctrl-C.
 
-Every device is recorded to `.npz`, also one of your own; its settings are those of conf/device/,
-changed as for `toftrack track`. An SR3000 may be recorded to `.srs`, too, as it sends its images:
-`toftrack record OUT.srs device.transport=emulated`. After a kill or a full disk
-`toftrack recover OUT.npz` makes the file of the frames that came until then.
+Any device can be recorded to `.npz`, also one of your own; its settings are those of conf/device/,
+changed as for `toftrack track`. An SR3000 can also be recorded to `.srs`, just as it sends its
+images: `toftrack record OUT.srs device.transport=emulated`. If recording was killed or the disk was
+full, `toftrack recover OUT.npz` makes the file from the frames that came until then.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = plain_parser("toftrack record", __doc__)
     add, folder = parser.add_argument, configuration_folder()
     add("out", metavar="OUT", help="the new recording, .npz or .srs")
-    add("--frames", type=int, help="stop after so many (default: at Ctrl-C)")
-    add("--seconds", type=float, help="stop after so long")
+    add("--frames", type=int, help="stop after this many (default: at Ctrl-C)")
+    add("--seconds", type=float, help="stop after this time")
     add("--limit", type=float, metavar="GB", help="stop at this size (default: 1)")
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--conf", default=folder, help="folder of the configuration")
     add("--config-dir", help="folder of choices of your own")
-    about = "device=KIND and settings of it, device.KEY=VALUE"
+    about = "device=KIND and its settings, device.KEY=VALUE"
     add("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=about)
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)

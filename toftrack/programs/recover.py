@@ -2,8 +2,8 @@
 
 Makes track.npz and summary.json anew from run.json and track.jsonl, which are whole up to the last
 frame that was done. The metrics need the recording that was tracked. A track.npz that has more
-frames than that stays, unless --replace is given. Of a recording, makes FILE.npz of the frames in
-FILE.npz.part.
+frames than that is kept, unless --replace is given. For a recording, makes FILE.npz from the frames
+in FILE.npz.part.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     about = "the output folder of toftrack track, or a recording"
     parser.add_argument("run", metavar="RUN|FILE", help=about)
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
-    about = "also a FILE.npz that is there, or a track.npz that has more frames"
+    about = "replace an existing FILE.npz, or a track.npz that has more frames"
     parser.add_argument("--replace", action="store_true", help=about)
     options = parser.parse_args(arguments)
     folder = Path(options.run).expanduser()

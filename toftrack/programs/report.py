@@ -285,18 +285,18 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
     about = (
-        "Gather the jobs of a sweep, or whatever runs are below a folder, into one table: for each"
-        " choice of settings the mean over its runs of a figure, its standard deviation over seeds"
-        " (spread), and the median time of a frame. `toftrack benchmark accuracy --compare` tells"
-        " settings apart with intervals."
+        "Gather the jobs of a sweep, or all runs below a folder, into one table. For each choice of"
+        " settings it shows a figure's mean over the runs, its standard deviation over seeds"
+        " (spread), and the median time of a frame. To compare settings with intervals, use"
+        " `toftrack benchmark accuracy --compare`."
     )
     parser = Parser(prog="toftrack report", description=about)
-    about = "the sweep's, multirun/DATE/TIME; to compare two runs, one into which you moved both"
+    about = "of the sweep, multirun/DATE/TIME; to compare two runs, move both into one folder"
     parser.add_argument("folder", nargs="+", help=about)
     about = (
-        "of summary.json, as metrics.fingertip_mm; default metrics.mean_mm, the mean joint error of"
-        " frames in the pose space from the sixth on, or metrics.trust.mean_all_mm, of all frames,"
-        " where a recording has none of these"
+        "a figure of summary.json, as metrics.fingertip_mm; default metrics.mean_mm, the mean joint"
+        " error of frames in the pose space from the sixth on, or metrics.trust.mean_all_mm, that"
+        " of all frames, if a recording has no such frames"
     )
     parser.add_argument("--figure", help=about)
     given = parser.parse_args(arguments)

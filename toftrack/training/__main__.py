@@ -14,13 +14,13 @@ from toftrack.programs.command_line import plain_parser, run
 _PROGRAM = "python -m toftrack.training"
 _TRAIN = f"""Trains the networks that find hands and propose poses, from nothing.
 
-  {_PROGRAM} train                     hours on two cores, half an hour on a GPU beside 16
+  {_PROGRAM} train                     hours on two cores, half an hour on 16 and a GPU
   {_PROGRAM} train seed=1              settings are KEY=VALUE
-  {_PROGRAM} train resume=FOLDER       an interrupted training, by its output folder
+  {_PROGRAM} train resume=FOLDER       continues an interrupted training, by its output folder
   {_PROGRAM} train --cfg job           all settings, composed
   {_PROGRAM} train --hydra-help        further options
 
-conf/train_detector.yaml has the settings, each with what it does."""
+conf/train_detector.yaml lists the settings and says what each does."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -59,15 +59,15 @@ def _parser() -> argparse.ArgumentParser:
         usage=f"{_PROGRAM} train [KEY=VALUE ...]",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    add = command("export", "make of weights the files that ONNX Runtime runs, beside them")
-    add("weights", nargs="?", type=Path, metavar="FILE", help="of `train` (the package's)")
+    add = command("export", "convert weights to files for ONNX Runtime, beside them")
+    add("weights", nargs="?", type=Path, metavar="FILE", help="of `train` (default: the package's)")
     add("--float", action="store_true", help="in floating point, not in 8 bits")
-    add = command("fit-confidence", "fit lost=calibrated: writes the file of lost.fitted")
-    add("overrides", nargs="*", help="of the tracker, as for track.py")
-    add("--sequences", type=int, default=200, help="how many are rendered (200)")
-    add("--frames", type=int, default=50, help="of each (50)")
-    add("--seed", type=int, default=1, help="of everything random (1)")
-    add("--output", type=Path, default=Path("confidence"), help="folder (confidence)")
+    add = command("fit-confidence", "fit lost=calibrated and write the file for lost.fitted")
+    add("overrides", nargs="*", help="settings of the tracker, as for track.py")
+    add("--sequences", type=int, default=200, help="how many to render (200)")
+    add("--frames", type=int, default=50, help="frames of each sequence (50)")
+    add("--seed", type=int, default=1, help="seed of everything random (1)")
+    add("--output", type=Path, default=Path("confidence"), help="folder to write into (confidence)")
     return parser
 
 
