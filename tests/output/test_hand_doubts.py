@@ -79,7 +79,7 @@ def test_a_focal_length_that_makes_the_hand_small_is_reported_at_the_end(
     words = [path, "device.intrinsics=[340,340,88,72]", "device.stop=24"]
     summary, said = tracked(tmp_path, capsys, *words)
     (doubt,) = summary["doubts"]
-    assert "as only small children's are" in doubt and f"note: {doubt}" in said
+    assert "as only small children's hands are" in doubt and f"note: {doubt}" in said
     assert summary["hand"]["fitted"] and summary["file"]["fitted"]["poses"] > 0
     assert ", fitted" in said
 

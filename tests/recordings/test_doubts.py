@@ -73,7 +73,7 @@ def test_a_lens_that_leaves_little_of_the_image_is_reported(
         ((70, 80), ""),
         ((176, 144), "images of about 352x288 pixels have"),
         ((44, 36), "images of about 88x72 pixels have"),
-        ((88, -20), "unless they are a part of larger ones"),
+        ((88, -20), "unless they are cut out of larger"),
     ],
 )
 def test_the_centre_of_another_resolution_is_reported(centre: tuple, words: str) -> None:

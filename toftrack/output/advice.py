@@ -214,24 +214,24 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
             "empty, and that its readings are not all invalid."
         ]
     if facts.farthest_m < _NO_CAMERA_M or facts.nearest_m > _NO_HAND_M:
-        return ["No hand is tracked there: check the unit, depth_m must be in metres."]
+        return ["No hand is tracked at that distance: check the unit, depth_m must be in metres."]
     found = []
     if mostly("out_of_reach"):
         found.append(
             f"Nothing was within segmentation.max_distance_m={reach_m:g}: hold the hand nearer, "
-            "or raise that; if it was nearer, the images are of another unit (device.unit_m)."
+            "or raise it; if the hand was nearer, the unit is wrong (device.unit_m)."
         )
     if mostly("too_near"):
         found.append(
-            f"Something was nearer than {_TOO_NEAR_M:g} m: keep the hand 0.3 to 1 m away, and the "
-            "view to it free."
+            f"Something was nearer than {_TOO_NEAR_M:g} m: keep the hand 0.3 to 1 m away, and "
+            "nothing in front of it."
         )
     if side is not None and counts["judged"] and mostly("other_side", "judged"):
         found.append(f"It looked like the other hand: {_if_it_is_the_other(side)}.")
     if counts["with_hand"] and mostly("small", "with_hand"):
         found.append(
-            f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold it nearer, or "
-            "let the camera give larger images."
+            f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold the hand "
+            "nearer, or let the camera give larger images."
         )
     if not found:
         which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
@@ -246,6 +246,6 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
 def _if_it_is_the_other(side: str) -> str:
     other = "left" if side == "right" else "right"
     return (
-        f"give hand.side={other}, or, if it is a {side} one, put the image right, which is "
+        f"give hand.side={other}; or, if it is a {side} one, correct the image, which is "
         "mirrored or has its rows and columns exchanged"
     )

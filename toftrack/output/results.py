@@ -388,9 +388,9 @@ class RealTime:
         quality = f", {self.reduced} of them with reduced effort" if self.reduced else ""
         return (
             f"{self.dropped} of {came} frames were dropped: the machine was too slow for "
-            f"{self.fps:g} frames/s, a frame with all that is done for it took {took_ms:.0f} ms"
-            f" ({self.tracked} were tracked{quality}). Let nothing else compute beside it, draw"
-            " less (view=none), or ask the camera for fewer frames or smaller images."
+            f"{self.fps:g} frames/s, as tracking, drawing and sending a frame took {took_ms:.0f} ms"
+            f" ({self.tracked} were tracked{quality}). Run nothing else meanwhile, draw less"
+            " (view=none), or ask the camera for fewer frames or smaller images."
         )
 
     def summary(self) -> dict[str, Any]:

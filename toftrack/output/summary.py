@@ -190,10 +190,10 @@ def apparent_doubt(length_m: float, k: np.ndarray) -> str:
 def _sentence(what: str, length_m: float, k: np.ndarray) -> str:
     small = length_m < DEFAULT_HAND_LENGTH_M
     usual, focal = 1e3 * DEFAULT_HAND_LENGTH_M, float(np.asarray(k)[0, 0])
-    whose = "only small children's are" if small else "hardly anybody's is"
+    whose = "only small children's hands are" if small else "hardly anybody's hand is"
     wrong = "large" if small else "small"
     return (
-        f"{what}, as {whose}: of anybody else, the focal length is too {wrong}, or the depth is in "
+        f"{what}, as {whose}: otherwise the focal length is too {wrong}, or the depth is in "
         f"another unit; fx = {focal * length_m / DEFAULT_HAND_LENGTH_M:.4g} instead of {focal:.4g} "
         f"pixels would make it {usual:.0f} mm (camera.file=FILE, or K of the recording)"
     )
@@ -215,7 +215,7 @@ def metrics_table(summary: dict[str, Any]) -> str:
     if metrics := summary.get("metrics"):
         rows = _trust_rows(metrics["trust"]) + rows + _error_rows(metrics)
         if metrics.get("ghost_pct") is not None:
-            rows.append(("another hand, where is none", f"{text_of(metrics['ghost_pct'])} %"))
+            rows.append(("a hand where there is none", f"{text_of(metrics['ghost_pct'])} %"))
         if second := metrics.get("second"):
             rows.append(("the other hand", f"in slot {second['slot']}"))
             rows += _trust_rows(second["trust"]) + _error_rows(second)
@@ -241,7 +241,7 @@ def _time_text(summary: dict[str, Any]) -> str:
     mean, median = summary["mean_ms"], summary["median_ms"]
     if not median or mean < 2 * median:
         return f"{text_of(mean)} ms ({text_of(summary['fps'])} frames/s)"
-    once = f"the mean, {text_of(mean)} ms, holds what is compiled or loaded once"
+    once = f"the mean, {text_of(mean)} ms, includes compiling and loading once"
     return f"{text_of(median)} ms ({text_of(1e3 / median)} frames/s), the median; {once}"
 
 
@@ -291,9 +291,9 @@ def _error_rows(metrics: dict[str, Any]) -> list[tuple[str, str]]:
     """Errors, regions, flags and when the hand was found again: names and texts."""
     rows: list[tuple[str, str]] = []
     if metrics["frames"]:
-        wrists = f"{text_of(metrics['wrist_aligned_mm'])} mm, wrists put together"
+        wrists = f"{text_of(metrics['wrist_aligned_mm'])} mm, after moving wrist onto wrist"
         rows = [
-            ("in the pose space", f"{metrics['frames']} frames from the sixth on; of these:"),
+            ("in the pose space", f"{metrics['frames']} frames from the sixth on, which have:"),
             ("joint error, mean", f"{text_of(metrics['mean_mm'])} mm"),
             ("joint error, median", f"{text_of(metrics['median_mm'])} mm"),
             ("fingertip error", f"{text_of(metrics['fingertip_mm'])} mm"),

@@ -124,8 +124,8 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     threshold, score = config.lost.get("score"), summary.get("mean_score")
     if None not in (threshold, score) and 2 * summary["lost_frames"] > summary["frames"]:
         _note(
-            f"the mean score is {score:.2f}, and below lost.score={threshold:g}, which suits the"
-            " F-measure, a frame is lost; where the picture shows a hand that is followed, lower it"
+            f"the mean score is {score:.2f}, and a frame below lost.score={threshold:g}, made for"
+            " the F-measure, is lost; lower that if the picture shows a hand that is followed"
         )
     if ended is not None:
         raise ended
@@ -156,8 +156,8 @@ class Run:
         about = self.device.description
         if dropped and about.get("realtime") and not about.get("repeat"):
             dropped += (
-                "the first frames take longest, which are many of a short recording;"
-                " device.repeat=true plays it on and on, and device.realtime=false drops none",
+                "the first frames take longest, and are a large part of a short recording;"
+                " device.repeat=true plays it again and again, device.realtime=false drops none",
             )
         # Hands are lost, too, where most frames are dropped.
         advice = () if self.realtime.too_slow else self.watch.advice(self._told())
@@ -167,7 +167,7 @@ class Run:
         if advice[1:] and (doubts := self.device.description.get("doubts")):
             # What there is to try may contradict it: hold nearer what is of another unit.
             advised = (f"If that is as it should be: {more}" for more in advice[1:])
-            advice = advice[0], f"First see to what was doubted: {doubts[0]}", *advised
+            advice = advice[0], f"First look into this: {doubts[0]}", *advised
         return dropped + advice
 
     def follow(self, results: ResultWriter, view: View, folder: Path) -> None:
@@ -343,7 +343,7 @@ def _opening(metadata: dict[str, Any], device: Device) -> str:
     if (hands := config.get("hands", 1)) > 1:
         what = f"up to {hands} hands, their lengths"
     elif (side := shape["side"]) == "auto":
-        what = "a hand of either side (hand.side=right or left to say which), its length"
+        what = "a hand of either side (hand.side=right or left says which), its length"
     else:
         other = "left" if side == "right" else "right"
         what = f"a {side} hand (hand.side={other} for the other), its length"

@@ -128,7 +128,7 @@ def gaps_doubt(timestamp_s: np.ndarray) -> str:
     return (
         f"frames are missing, or came late: {gaps.size} of {steps.size} steps in time are longer "
         f"than {_LONG_STEP:g} times the usual {usual:.3g} s, the first, of {steps[first]:.3g} s, "
-        f"after frame {first}; a hand that moves fast is followed worse there"
+        f"after frame {first}; a fast hand is followed less well there"
     )
 
 
@@ -160,8 +160,8 @@ def centre_doubt(camera: Camera) -> str:
     width, height = 2 * np.maximum(centre, 0.5)
     return (
         f"K has its centre at {centre[0]:g}, {centre[1]:g}, as images of about {width:.0f}x"
-        f"{height:.0f} pixels have, but these have {size[0]}x{size[1]}; give K of this size, unless"
-        " they are a part of larger ones"
+        f"{height:.0f} pixels have, but these have {size[0]}x{size[1]}; give K for this size, "
+        "unless they are cut out of larger images"
     )
 
 
@@ -171,7 +171,7 @@ def lens_doubt(camera: Camera) -> str:
     if kept >= _KEPT:
         return ""
     text = (
-        f"of the image only {100 * kept:.0f} % is left when the lens's distortion "
+        f"only {100 * kept:.0f} % of the image is left when the lens's distortion "
         f"{[float(f'{value:.4g}') for value in camera.distortion]} is undone"
     )
     for what, other in _other_lenses(camera):
