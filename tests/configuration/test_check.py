@@ -53,14 +53,14 @@ WRONG = [
     ("device=replay device.intrinsics=5,5,3,2", "give one, or a list, 'device.intrinsics=[5,5,3"),
     ("device=replay device.K=[5,5,3,2]", "no setting device.K; did you mean device.intrinsics?"),
     ("view=web", "did you mean view=browser?"),
-    ("pose_space.file=a.npz pose_space.data=natural", "data=natural is of learning, and pose_"),
+    ("pose_space.file=a.npz pose_space.data=natural", "data=natural is for learning, but pose_"),
     ("device.path=a (1).npz", "give the recording by its name alone: toftrack track 'a (1)"),
     ("start=rough", "start belongs to experiment=paper; give experiment=paper as well, or leave"),
     ("start.pose=0.1", "start.pose belongs to experiment=paper; "),
     ("experiment=paper start.psoe=0.1", "no setting start.psoe; did you mean start.pose?"),
     # Parts of two trackers do not mix.
     ("detector=none", "detector=none belongs to experiment=paper, the tracker without networks; "),
-    ("experiment=paper lost=calibrated", "lost=calibrated goes with these alone; leave "),
+    ("experiment=paper lost=calibrated", "lost=calibrated works only with networks"),
 ]
 
 
@@ -78,7 +78,7 @@ def test_what_a_space_is_learned_from_is_not_said_as_to_the_tracker() -> None:
         check.check_overrides(compose("train_pose_space", given), "train_pose_space", given)
         given = ["pose_space.data=natural"]
         config = compose("train_pose_space", given)
-        with pytest.raises(ToftrackError, match="says nothing here; give data=natural$"):
+        with pytest.raises(ToftrackError, match="of the tracker; give data=natural to train$"):
             check.check_overrides(config, "train_pose_space", given)
 
 

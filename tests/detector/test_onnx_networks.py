@@ -130,7 +130,7 @@ def test_a_file_of_other_weights_is_not_used(
 ) -> None:
     torch.manual_seed(2)
     save_weights(weights, PoseNet(4), Finder(8), {})
-    assert "small.pose.onnx is of other weights" in torch_runs(weights, caplog)
+    assert "small.pose.onnx belongs to other weights" in torch_runs(weights, caplog)
 
 
 def test_a_file_that_is_damaged_or_no_network_is_refused_in_a_sentence(weights: Path) -> None:
@@ -163,7 +163,7 @@ def test_outputs_of_another_shape_never_reach_compiled_code(weights: Path) -> No
             return [np.zeros((1, 7), np.float32), *maps]
 
     crops = np.zeros((1, CROP_CHANNELS, CROP, CROP), np.float32)
-    with pytest.raises(ToftrackError, match="is of another network"):
+    with pytest.raises(ToftrackError, match="belongs to another network"):
         OnnxPoseNet(weights, Other()).outputs(crops)
 
 

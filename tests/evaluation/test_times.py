@@ -46,7 +46,7 @@ def test_frames_count_in_which_the_hands_are_believed(tmp_path) -> None:
         np.savez(short, **{k: v[:15] if v.shape[:1] == (80,) else v for k, v in sample.items()})
     quick = ("hand.side=left", "experiment=paper")
     assert 0 < len(runner(Program("one", quick, str(short), hands=1))()) <= 5
-    with pytest.raises(ToftrackError, match="2 hands were in none"):
+    with pytest.raises(ToftrackError, match="none of its frames has 2"):
         runner(Program("two", quick, str(short), hands=2))()
 
 

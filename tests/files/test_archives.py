@@ -96,7 +96,7 @@ def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path) -> None:
     shape = (128, 2**20 // 4)
     path = save(tmp_path / "bomb.npz", {"a": [header(shape), *[ZEROS] * 128]}, DEFLATED)
     assert path.stat().st_size < 2**20
-    assert "'a': it would make 134 MB of" in reported(path)
+    assert "'a': it would unpack" in reported(path)
 
 
 def with_more_than_stated(path: Path, method: int) -> Path:
@@ -188,7 +188,7 @@ def test_an_array_beyond_the_cap_is_refused(
 
 def test_other_compressions_are_refused(tmp_path: Path) -> None:
     path = save(tmp_path / "a.npz", {"a": npy(np.ones(3))}, zipfile.ZIP_LZMA)
-    assert "'a': its compression is not read; save it with numpy.savez" in reported(path)
+    assert "'a': its compression is unknown; save it with numpy.savez" in reported(path)
 
 
 @every_method

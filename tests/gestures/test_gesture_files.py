@@ -105,7 +105,7 @@ def test_poses_are_read_as_they_were_saved(tmp_path: Path) -> None:
         ([{"name": "v", "angles": ROCK}], "radians", "if they are degrees"),
         ([{"angles": ROCK}], "degrees", "pose 1 has no name"),
         ([{"name": "v", "angles": {"index_flexion": 9}}], "degrees", "unknown angle"),
-        ([{"name": "other", "angles": ROCK}], "degrees", "none of the classes"),
+        ([{"name": "other", "angles": ROCK}], "degrees", "none of the gestures"),
         ([{"name": "v", "angles": ROCK, "spread": [-1] * 21}], "degrees", "a spread below 0"),
     ],
 )

@@ -95,12 +95,13 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     for word in overrides if of_file else ():
         if re.match(r"\+*pose_space\.(?!(dims|file|kind)\b|_)", word):
             raise ToftrackError(
-                f"{word} is of learning, and pose_space.file={space['file']} is learned; give one"
+                f"{word} is for learning, but pose_space.file={space['file']} is learned already; "
+                "leave one out"
             )
     for word in overrides if name == "train_pose_space" else ():
         if re.match(r"\+*pose_space\.data=", word):
             raise ToftrackError(
-                f"{word} is the tracker's, and says nothing here; give {word.partition('.')[2]}"
+                f"{word} is a setting of the tracker; give {word.partition('.')[2]} to train"
             )
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -155,8 +156,8 @@ def check_interpolations(config: DictConfig) -> None:
 
     if size(()) > MOST_VALUES:
         raise ToftrackError(
-            "interpolations (${...}) make the configuration too large, as they stand for one "
-            f"another (for at most {MOST_VALUES} values in all); write what they stand for"
+            "interpolations (${...}) that stand for one another make the configuration too large "
+            f"(at most {MOST_VALUES} values in all); write the values instead"
         )
 
 
@@ -192,7 +193,7 @@ def check_tracker(config: DictConfig) -> None:
         )
     if without:
         raise ToftrackError(
-            f"experiment=paper has no networks, and {some} goes with these alone; leave {some} out,"
+            f"{some} works only with networks, which experiment=paper lacks; leave {some} out,"
             " or leave experiment=paper out"
         )
     raise ToftrackError(

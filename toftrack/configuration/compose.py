@@ -90,7 +90,7 @@ def searched(folder: str | Path) -> str:
     """
     path = Path(folder).expanduser().resolve()
     if not path.is_dir():
-        raise ToftrackError(f"there is no folder '{folder}'; give --config-dir one")
+        raise ToftrackError(f"there is no folder '{folder}'; give --config-dir one that exists")
     import_from(path)
     return f"hydra.searchpath=[{quoted(f'file://{path}')}]"
 

@@ -53,7 +53,8 @@ def _entry_points(_: tuple[str, ...]) -> Any:
     except Exception as error:  # whatever a damaged file of any package raises
         reason = " ".join(str(error).split())
         _log.warning(
-            "what installed packages bring is left out: an entry_points.txt says %s", reason
+            "no parts of installed packages are used: an entry_points.txt cannot be read: %s",
+            reason,
         )
         return EntryPoints()
 

@@ -72,7 +72,7 @@ class OnnxPoseNet(OnnxNetwork):
         # Compiled code reads them, and believes their shapes.
         shapes = [(n, REPORTED), (n, 5 * JOINTS, CELLS, CELLS), (n, 4 * SEGMENTS, CELLS, CELLS)]
         if [(one.dtype, one.shape) for one in outputs] != [(np.float32, one) for one in shapes]:
-            raise ToftrackError("the detector's pose.onnx is of another network; " + _anew())
+            raise ToftrackError("the detector's pose.onnx belongs to another network; " + _anew())
         heads, keypoints, parts = outputs
         return heads, keypoints, parts
 
@@ -106,7 +106,7 @@ def load_networks(
         made_of = session and session.get_modelmeta().custom_metadata_map
         known = made_of and tuple(map(made_of.get, _MADE_OF))
         if known != (FORMAT, VERSION, network, sha256):
-            why = f"{file} is of other weights" if session else f"there is no {file}"
+            why = f"{file} belongs to other weights" if session else f"there is no {file}"
             remedy = f"make it with {COMMAND} {weights}"
             _warn(f"{why}: torch runs the detector's networks, slower; {remedy}")
             return load_weights(weights)[:2]

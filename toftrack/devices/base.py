@@ -66,8 +66,8 @@ def frames_of(device: BaseDevice) -> Iterator[Frame]:
             place = code and f"{code.co_qualname} ({code.co_filename}, line {code.co_firstlineno})"
             raise ToftrackError(
                 "a device must yield Frame(index, timestamp_s, depth, amplitude, radial), and "
-                "nothing where there is no image, but "
-                f"{type(frame).__name__} came, in {place or type(device).__name__}"
+                "nothing when there is no image, but "
+                f"it yielded {type(frame).__name__}, in {place or type(device).__name__}"
             )
         yield frame
 

@@ -63,14 +63,14 @@ def chosen_serial(
         )
     if serial is None and len(numbers) > 1:
         raise ToftrackError(
-            f"there are {len(numbers)} {maker} cameras; choose one with device.serial=, of {listed}"
+            f"there are {len(numbers)} {maker} cameras; set device.serial to one of {listed}"
         )
     for number in numbers:
         # A number on the command line loses its zeros.
         if serial is None or number.lstrip("0") == str(serial).lstrip("0"):
             return number
     raise ToftrackError(
-        f"there is no {maker} camera of the serial number {serial}; there is {listed}"
+        f"there is no {maker} camera with the serial number {serial}; there is {listed}"
     )
 
 
@@ -90,7 +90,7 @@ def chosen_profile(offered: Sequence[T], size_of: Callable[[T], Size], size: Siz
     listed = ", ".join("{}x{} at {}".format(*s) for s in sorted(set(map(size_of, offered))))
     raise ToftrackError(
         f"{owner} has no depth images of device.width={size[0]}, device.height={size[1]}, "
-        f"device.fps={size[2]}; set them to one of {listed} (a USB 2 port or cable leaves few)"
+        f"device.fps={size[2]}; set them to one of {listed} (a USB 2 port or cable offers few)"
     )
 
 
@@ -230,8 +230,8 @@ class SdkCamera(BaseDevice):
             if numbers.index < 0:
                 raise ToftrackError(f"'{self._path}' has no frame with depth; record it again")
             raise ToftrackError(
-                f"'{self._path}' has no frame from start={self._start} on, but {numbers.index + 1} "
-                "before; choose a smaller device.start"
+                f"'{self._path}' has {numbers.index + 1} frames, none from start={self._start} on; "
+                "choose a smaller device.start"
             )
 
     def _wait(self, begun: bool) -> Any | None:

@@ -122,9 +122,9 @@ def _divided(words: Sequence[str], hands: int = 1) -> tuple[list[str], list[str]
         elsewhere = key.split(".")[0] in _GIVEN_ELSEWHERE and key != "hydra.searchpath"
         if key == "hand.side" or elsewhere:
             raise ToftrackError(
-                f"{word} cannot be given here: recordings are named, with the camera that they "
-                "have, sides, seeds and hands are given by --side, --seeds and --hands, and "
-                "nothing is shown, streamed or smoothed"
+                f"{word} cannot be given here: recordings come with their cameras, --side, --seeds "
+                "and --hands give sides, seeds and the number of hands, and nothing is shown, "
+                "streamed or smoothed"
             )
     if hands > 1:
         overrides.append(f"hands={hands}")

@@ -94,7 +94,7 @@ def programs(two_hands: Sequence[str] = ()) -> list[Program]:
         name = Path(path).stem
         with Replay(path) as device:
             if device.truth is None:
-                raise ToftrackError(f"{path}: there is no truth in it; give a recording that has")
+                raise ToftrackError(f"{path} has no truth; give a recording that has")
             side = device.truth.side
         found.append(Program(f"{name}, one hand", (f"hand.side={side}",), str(path), hands=1))
         found.append(Program(f"{name}, both", (f"hand.side={side}", "hands=2"), str(path), hands=2))
@@ -157,7 +157,7 @@ def runner(program: Program) -> Runner:
             if program.recording is None or (seen >= _UNDERWAY and believed >= program.hands):
                 found.append(took)
         if not found:
-            raise ToftrackError(f"{program.hands} hands were in none of its frames")
+            raise ToftrackError(f"none of its frames has {program.hands} hands")
         return found
 
     return once

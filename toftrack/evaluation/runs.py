@@ -79,8 +79,8 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
             what = f"'{path}' {'holds no recording' if path.is_dir() else 'is no recording'}"
             if known:
                 raise ToftrackError(
-                    f"{what} that the labels fit, by the images' size and, of stills, their number;"
-                    " give the one that was labelled"
+                    f"{what} whose images fit the labels in size and, for stills, in number; give"
+                    " the one that was labelled"
                 )
             raise ToftrackError(
                 f"{what} with truth (an .npz with 'joints_m'); give one that has, or labels of its "
@@ -206,7 +206,7 @@ def _true_rows(job: Job, device: Replay) -> list[Row]:
     if job.side == "told" and not truth.side:
         raise ToftrackError(
             f"'{job.source.path}' does not say whose hand it shows ('side' in its metadata), "
-            "and so no side can be given; give --side auto"
+            "so --side told cannot know; give --side auto"
         )
     reported, others = _tracked(device, job, truth.side)
     rows = [_row(job, device, truth, reported)]

@@ -129,7 +129,7 @@ class Archive:
         entry = self._entries[name]
         with broken_is_value_error(name):
             if entry.compress_type not in _METHODS:
-                raise ValueError("its compression is not read; save it with numpy.savez_compressed")
+                raise ValueError("its compression is unknown; save it with numpy.savez_compressed")
             with self._zip.open(entry) as plain:  # its own header, checked
                 packed = entry.compress_type == zipfile.ZIP_BZIP2
                 stream = bz2.BZ2File(_Packed(self._stream, entry)) if packed else plain
@@ -257,7 +257,7 @@ def _check(header: Header, entry: zipfile.ZipInfo) -> None:
         raise ValueError(f"it is a text of {header.size / 1e6:.0f} MB")
     if entry.file_size > max(_SMALL_BYTES, _MOST_RATIO * entry.compress_size):
         raise ValueError(
-            f"it would make {entry.file_size / 1e6:.0f} MB of {entry.compress_size} bytes"
+            f"it would unpack {entry.compress_size} bytes to {entry.file_size / 1e6:.0f} MB"
         )
 
 

@@ -170,7 +170,7 @@ def known_lens(
     views = _enough(views, board)
     if camera.lens == "fisheye":
         raise ToftrackError(
-            "a fisheye lens cannot be kept; leave out --keep-lens, which fits another model to it"
+            "a fisheye lens cannot be kept; leave out --keep-lens, so that another model is fitted"
         )
     points, rvecs, tvecs, errors = board_points(board, square_m), [], [], []
     for view in views:

@@ -129,7 +129,7 @@ class Camera:
         for size in (self.width, self.height):
             if not isinstance(size, Real) or not 1 <= size < math.inf or size % 1:
                 raise ToftrackError(
-                    f"the image size {self.width}x{self.height} is not of two whole numbers above 0"
+                    f"the image size {self.width}x{self.height} must be two whole numbers above 0"
                 )
         _check_plausible(K, int(self.width), int(self.height))
         object.__setattr__(self, "K", K)

@@ -48,7 +48,7 @@ def read_poses(path: str | Path) -> list[NamedPose]:
     path = Path(path).expanduser()
     reader = {".json": _read_json, ".csv": _read_csv}.get(path.suffix.lower())
     if reader is None:
-        raise ToftrackError(f"{path} is neither .json nor .csv; give gestures.file=FILE of either")
+        raise ToftrackError(f"{path} is neither .json nor .csv; give gestures.file=FILE as one")
     what = f"{path} cannot be read as a file of gestures"
     with reported_errors(what, "give gestures.file=FILE", OSError, ValueError, csv.Error):
         units, rows = reader(path)
@@ -58,7 +58,7 @@ def read_poses(path: str | Path) -> list[NamedPose]:
     angles = np.array([_angles(path, name, row) for name, row in named])
     spread = np.nan_to_num([_angles(path, name, row.get("spread") or {}) for name, row in named])
     if (spread < 0).any():
-        raise ToftrackError(f"{path} has a spread below 0, and a standard deviation is none")
+        raise ToftrackError(f"{path} has a spread below 0; give standard deviations, 0 or more")
     radians = in_radians(path, angles, units, "say in it that they are {}")
     spread = np.radians(spread) if units == "degrees" else spread
     return [

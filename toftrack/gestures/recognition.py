@@ -207,7 +207,7 @@ def gestures_with(
     taken = {pose.name for pose in named}
     if OTHER in taken:
         raise ToftrackError(
-            f"{source} names a gesture 'other', which is what is none of the classes"
+            f"{source} names a gesture 'other', which means none of the gestures; rename it"
         )
     basic = [definition for definition in SETS[known] if definition.name not in taken]
     definitions = [*basic, *map(definition_of, named)]
@@ -225,8 +225,8 @@ def gestures_with(
         name = definitions[own].name
         if np.isnan(definitions[own].low[features.FLEXION]).all():
             raise ToftrackError(
-                f"{source}: gesture {name!r} says nothing of any finger's flexion; give all three"
-                " flexions of at least one finger"
+                f"{source}: gesture {name!r} says nothing about any finger's flexion; give all"
+                " three flexions of at least one finger"
             )
         for other in range(own):
             different = definitions[other].name not in (name, OTHER)

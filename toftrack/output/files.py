@@ -115,7 +115,7 @@ def _one_writer(folder: Path) -> Iterator[None]:
     except BlockingIOError:
         raise ToftrackError(
             f"another run is writing into the folder '{folder}' just now; wait for its end, or "
-            "choose another folder with hydra.run.dir=DIR, or of a sweep hydra.sweep.dir=DIR"
+            "choose another folder with hydra.run.dir=DIR (for a sweep: hydra.sweep.dir=DIR)"
         ) from None
 
 
@@ -130,7 +130,7 @@ def make_way(folder: Path) -> None:
         for name in (LINES, *ends):
             if not _may_go(folder / name):
                 raise ToftrackError(
-                    f"'{folder}' has a {name}, but no run.json that says that it is a run's; take "
+                    f"'{folder}' has a {name}, but no run.json to show that a run made it; move "
                     "it away, or choose another folder with hydra.run.dir=DIR"
                 )
     for name in ends:

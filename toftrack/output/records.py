@@ -82,8 +82,8 @@ class Records:
             records.close()
             if isinstance(error, KeyError) and error.args[0] in KINDS:
                 raise ToftrackError(
-                    f"'{lines}' is of another toftrack: its lines have no '{error.args[0]}'; take "
-                    "the one that 'toftrack' in run.json names"
+                    f"'{lines}' is of another toftrack: its lines have no '{error.args[0]}'; use "
+                    "the version that run.json names as 'toftrack'"
                 ) from None
             if isinstance(error, (ArithmeticError, LookupError, TypeError, ValueError)):
                 raise damaged(lines, last, f"it or one shortly before: {error!r}") from None

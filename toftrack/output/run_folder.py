@@ -76,7 +76,7 @@ class Run:
         about = self.results["metadata"].get("camera")
         known = {one.name for one in fields(Camera)}
         if not isinstance(about, dict) or not {"K", "width", "height"} <= about.keys():
-            raise ToftrackError(f"the run in '{self.folder}' does not say with which camera it was")
+            raise ToftrackError(f"the run in '{self.folder}' does not say which camera it had")
         return Camera(**{name: value for name, value in about.items() if name in known})
 
     def footage(self, recording: str | Path | None = None) -> Footage | None:
@@ -145,7 +145,7 @@ class Run:
         space = make_pose_space(**settings)
         if space.dims != self.results["latent"].shape[-1]:
             raise ToftrackError(
-                f"'{settings.get('file')}' is no more the {self.results['latent'].shape[-1]}-"
+                f"'{settings.get('file')}' is no longer the {self.results['latent'].shape[-1]}-"
                 "dimensional pose space of the run; put the old file back"
             )
         return space
@@ -160,7 +160,7 @@ class Run:
         settings = self.config.get(group)
         if not isinstance(settings, dict):
             raise ToftrackError(
-                f"'{self.folder / 'track.npz'}' does not say with which {group} it was made; run "
+                f"'{self.folder / 'track.npz'}' does not say which {group} made it; run "
                 "track.py again with this version"
             )
         return settings
@@ -323,8 +323,8 @@ def _synthetic(device: dict[str, Any]) -> Recording:
     """The frames that `device=synthetic` made, made again."""
     if not (isinstance(device.get("frames"), int) and 1 <= device["frames"] <= _MOST_SYNTHETIC):
         raise ToftrackError(
-            f"the run's synthetic frames cannot be made again: {device.get('frames')} are none, or"
-            f" more than {_MOST_SYNTHETIC}; keep them next time, with record=FILE"
+            f"the run's synthetic frames cannot be made again: there must be 1 to "
+            f"{_MOST_SYNTHETIC}, not {device.get('frames')}; keep them next time, with record=FILE"
         )
     made = Synthetic(**{key: value for key, value in device.items() if key != "_target_"})
     frames = list(made)

@@ -74,7 +74,7 @@ class StdoutStream(Stream):
         if not hasattr(select, "PIPE_BUF"):
             raise ToftrackError(
                 "stream=stdout needs pipes that say whether they are full, which this operating "
-                "system has not; use stream=udp"
+                "system lacks; use stream=udp"
             )
         self._lines: deque[bytes] = deque(maxlen=waiting)
         self._rest = b""

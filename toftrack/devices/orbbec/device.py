@@ -196,8 +196,8 @@ def load_sdk() -> ModuleType:
             raise ImportError(f"the installed one has no {missing[0]}")
     except ImportError as error:
         raise ToftrackError(
-            f"device=orbbec needs pyorbbecsdk2 ({error}): pip install 'toftrack[orbbec]', or for "
-            "the newest one, whose requirements others contradict, pip install --no-deps "
+            f"device=orbbec needs pyorbbecsdk2 ({error}): pip install 'toftrack[orbbec]', or, for "
+            "the newest one, whose requirements clash with others, pip install --no-deps "
             "pyorbbecsdk2"
         ) from error
     ob.Context.set_logger_level(ob.OBLogLevel.NONE)

@@ -61,7 +61,7 @@ class RealSense(SdkCamera):
             raise ToftrackError(f"device.transport={transport} is unknown; give usb or emulated")
         if bag is not None and transport == "emulated":
             raise ToftrackError(
-                "device.bag is a recording of its own; leave out device.transport=emulated (whose "
+                "device.bag already gives the frames; leave out device.transport=emulated (whose "
                 "recording is device.emulated.source)"
             )
         self._begin(bag, keep, queue_frames, start, stop, timeout_s)

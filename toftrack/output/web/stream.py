@@ -59,7 +59,7 @@ class WebSocketStream(Stream):
         """Of the first page, within the `with`."""
         print(
             f"the hand in 3-D: {self.url}, point and pinch: {self.url}point, for programs: "
-            f"ws{self.url[4:-1]}{STREAM} (lines come from the first frame on, for which a first "
+            f"ws{self.url[4:-1]}{STREAM} (lines come from the first frame on; before it, a first "
             "run compiles for up to a minute)",
             file=sys.stderr,
             flush=True,
