@@ -193,10 +193,10 @@ def test_a_part_that_exits_while_it_loads_is_told(package: Path) -> None:
     (package / "device" / "odd.yaml").write_text("_target_: my_camera.Camera\n")
     status, _, err = programs.call("--config-dir", ".", "device=odd", folder=package)
     assert (status, "Traceback" in err) == (1, False)
-    assert "error: a part that is not toftrack's ended it, in <module> (" in err
+    assert "error: a part that is not toftrack's ended the program, in <module> (" in err
 
 
-KIND = "holds a pose space of the kind 'autoencoder.Autoencoder', which is not there; there are"
+KIND = "the pose space kind 'autoencoder.Autoencoder' is unknown; known are"
 
 
 def test_a_model_file_names_its_kind_and_imports_nothing(
@@ -211,7 +211,7 @@ def test_a_model_file_names_its_kind_and_imports_nothing(
     angles = again.decode(again.training_latents)
     assert torch.allclose(angles, own.decode(own.training_latents))
     del sys.modules["autoencoder"]
-    with pytest.raises(ToftrackError, match="of the kind 'Autoencoder', which is not there"):
+    with pytest.raises(ToftrackError, match="kind 'Autoencoder' is unknown"):
         load_pose_space(model)
     content = read_archive(model)
     header = json.loads(str(content["header"])) | {"kind": "autoencoder.Autoencoder"}
@@ -227,7 +227,7 @@ def test_a_model_file_names_its_kind_and_imports_nothing(
         ("nowhere.Space", "pose_space.kind names nowhere.Space, which cannot be imported (No modu"),
         ("json.JSONDecoder", "pose_space.kind=json.JSONDecoder is no subclass of PoseSpace"),
         ("toftrack.pose_space.base.PoseSpace", "has no class method fit, and cannot be learned"),
-        ("magic", "pose_space kind 'magic', which is not there; there are isomap, kernel_pca"),
+        ("magic", "pose space kind 'magic' is unknown; known are isomap, kernel_pca"),
     ],
 )
 def test_a_kind_that_cannot_be_used_is_one_sentence(kind: str, words: str) -> None:
@@ -290,7 +290,9 @@ def test_a_likelihood_tracks_as_the_page_says_and_else_hears_of_its_threshold(
     assert given == (
         json.loads((tmp_path / "out" / "summary.json").read_text())["lost_frames"] == 0
     )
-    assert given == (re.search(r"the mean score is 0\.3\d, and below lost.score=0.5", err) is None)
+    assert given == (
+        re.search(r"the mean score is 0\.3\d, and a frame below lost.score=0.5", err) is None
+    )
     assert "overlay.png" not in err and ("5 of 5 frames were lost" in err) != given
 
 
@@ -306,7 +308,7 @@ PAPER = ("experiment=paper", "gestures=none", "hand.side=right")
         ("1 / union.clamp(min=1)", r"gives \[1.0, 1.0\]"),
         (
             "counts.correct",
-            r"gives \[\d+.0\] where correct is \[\d+.0\]; let it give \(N,\) numbers",
+            r"gives \[\d+.0\] where correct is \[\d+.0\]; it must give \(N,\) numbers",
         ),
     ],
 )
@@ -353,7 +355,7 @@ def test_a_space_of_ones_own_is_measured_in_double_and_swept_from_its_file(mine:
         ("pose_space.dims=3", "is a 4-dimensional Independent .*; give pose_space.dims=4$"),
         (
             "pose_space.iterations=5",
-            "^pose_space.iterations=5 is of learning, and pose_space.file=",
+            "^pose_space.iterations=5 is for learning, but pose_space.file=",
         ),
     ):
         with pytest.raises(ToftrackError, match=said):

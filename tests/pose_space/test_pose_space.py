@@ -222,7 +222,7 @@ def rewrite(path: Path, header: dict, **arrays: np.ndarray | None) -> None:
     [
         ({"version": 99}, {}, "version 99"),
         ({"format": "other"}, {}, "not a pose-space file"),
-        ({"kind": "hologram"}, {}, "the kind 'hologram', which is not there; there are isomap"),
+        ({"kind": "hologram"}, {}, "the pose space kind 'hologram' is unknown; known are isomap"),
         ({"angle_names": ["a", "b"]}, {}, "other joint angles"),
         ({"training_labels": ["palm"]}, {}, "bounds or labels do not fit"),
         ({}, {"mean": None}, "no array 'mean'"),

@@ -189,7 +189,7 @@ def test_results_that_find_no_room_are_recovered_as_is_said(
     assert len(toftrack.read_results(folder / "track.npz")["lost"]) == 3
     assert len(tracking.results().lost) == 3 and list(tmp_path.iterdir()) == [folder]
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
-    with pytest.raises(toftrack.ToftrackError, match="no place for the results.*set TMPDIR"):
+    with pytest.raises(toftrack.ToftrackError, match="no temporary folder.*set TMPDIR"):
         tracking.results()
 
 

@@ -167,7 +167,7 @@ def test_at_the_limit_the_command_ends_well(
         settings = (kind, "device.transport=emulated", "device.emulated.fps=200")
         assert record(str(path), *settings, "--limit", "0.0004") == 0
         reported = capsys.readouterr()
-        assert "it has 0.0004 GB, its limit" in reported.err
+        assert "its limit, 0.0004 GB" in reported.err
         assert f"{path}: " in reported.out
         assert 0.0004e9 <= path.stat().st_size < 0.0008e9
         assert Replay(path).frames > 2

@@ -89,7 +89,7 @@ def test_less_than_there_is_is_only_made_when_asked(run: Path) -> None:
 
 def test_a_file_in_the_place_of_the_results_is_only_replaced_when_asked(run: Path) -> None:
     (run / "track.npz").write_bytes(PRECIOUS)
-    with pytest.raises(ToftrackError, match="damaged, or no run's.*--replace"):
+    with pytest.raises(ToftrackError, match="damaged or not a run's.*--replace"):
         recover(run)
     assert (run / "track.npz").read_bytes() == PRECIOUS
     assert recover(run, replace=True)["frames"] == 6

@@ -81,7 +81,7 @@ def test_a_lens_is_reported_once(folder: Path) -> None:
     words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
     with make_device(*words) as device:
         np.testing.assert_array_equal(device.camera.K, K)
-    with pytest.raises(ToftrackError, match="both tell the lens; leave one out"):
+    with pytest.raises(ToftrackError, match="both give the lens; leave one out"):
         make_device(*words, LENS)
 
 
@@ -179,7 +179,7 @@ def test_the_depth_among_the_images_is_read_and_the_rest_told(
         ({"1.exr": b"\x76\x2f\x31\x01junk"}, "1.exr.*damaged"),
         ({"1.tif": tiff(0)[:90]}, "1.tif.*damaged"),
         ({"1.tif": b"nonsense"}, "1.tif.*another kind"),
-        ({"1.tif": cv2.imencode(".tif", 1000 * DEPTH[0])[1].tobytes()}, "plainly another unit"),
+        ({"1.tif": cv2.imencode(".tif", 1000 * DEPTH[0])[1].tobytes()}, "plainly in another unit"),
     ],
 )
 def test_images_that_are_no_depth_are_reported(
@@ -200,7 +200,7 @@ def test_images_that_are_no_depth_are_reported(
             for name in ("../1.png", "/1.png", "a\\..\\1.png", "C:/1.png", "\0")
         ),
         ("1.png", 0o120777, zipfile.ZIP_DEFLATED, "is a link"),
-        ("1.png", 0, zipfile.ZIP_LZMA, "compression is not read"),
+        ("1.png", 0, zipfile.ZIP_LZMA, "compression is unknown"),
     ],
 )
 def test_archives_that_lead_elsewhere_are_refused(

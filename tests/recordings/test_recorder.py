@@ -205,7 +205,7 @@ def test_nothing_is_written_through_a_link(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("limit_gb", "free", "why"),
-    [(8e-6, 10**12, "8e-06 GB, its limit"), (1.0, 6000, "the disk is nearly full")],
+    [(8e-6, 10**12, "its limit, 8e-06 GB"), (1.0, 6000, "the disk is nearly full")],
 )
 def test_at_its_limit_and_before_the_disk_is_full_it_ends_as_a_whole_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit_gb: float, free: int, why: str

@@ -141,7 +141,7 @@ def test_a_single_image_is_a_stack_of_one(tmp_path: Path) -> None:
     ("stack", "words"),
     [
         (np.ones((2, 3, 4, 3)), "must be depth images"),
-        (np.full((2, 24, 32), 900.0), "plainly another unit.*--source-unit"),
+        (np.full((2, 24, 32), 900.0), "plainly in another unit.*--source-unit"),
         (np.array([[None] * 4] * 3), "Python objects"),
     ],
 )
@@ -226,7 +226,7 @@ def test_what_hdf5_keeps_elsewhere_or_makes_of_nothing_is_not_read(tmp_path: Pat
             opened(tmp_path / "a.h5", name)
     with h5.File(tmp_path / "b.h5", "w") as file:
         file.create_dataset("depth", (10**6, HEIGHT, WIDTH), "u2", chunks=(1, HEIGHT, WIDTH))
-    with pytest.raises(ToftrackError, match="would make 1536 MB of 0 bytes"):
+    with pytest.raises(ToftrackError, match="would unpack 0 bytes to 1536 MB"):
         opened(tmp_path / "b.h5")
 
 

@@ -21,7 +21,7 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "poses.checkpoint.pt"
     save(path, progress, {"batch": 24, "seed": 0})
     resumed.restore("poses", progress, {"batch": 24, "seed": 0})
-    with pytest.raises(ToftrackError, match="a training with batch=24, and now it is 32"):
+    with pytest.raises(ToftrackError, match="a training with batch=24, but now batch=32"):
         resumed.restore("poses", progress, {"batch": 32, "seed": 0})
     other = torch.nn.Linear(3, 2)
     wrong = Progress(other, other, torch.optim.AdamW(other.parameters()), 24)

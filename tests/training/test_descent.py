@@ -247,5 +247,5 @@ def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
     assert course[-1]["images"] == 48
     same(whole, rest)
     interrupted(train_finder, late, monkeypatch, after=3)
-    with pytest.raises(ToftrackError, match="finder.images cannot become 48 any more; give 24"):
+    with pytest.raises(ToftrackError, match="finder.images can no longer change from 24 to 48"):
         train_finder(more_images, 6, 0, replace(resumed, resume=late.folder))

@@ -53,7 +53,7 @@ def sentence(error: BaseException) -> str:
         if isinstance(cause, OSError) and not isinstance(cause, HydraException):
             return _of_system(cause)
     if any(isinstance(cause, RecursionError) for cause in chain):
-        return "a setting or a file is nested too deeply; take out what is not meant"
+        return "a setting or a file is nested too deeply; remove what is not meant"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
         return (
             f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
@@ -71,8 +71,8 @@ def sentence(error: BaseException) -> str:
     of_groups = last is not None and last.f_globals.get("__name__") == _DEFAULTS_LIST
     if of_groups or text.startswith("Config group override must be"):
         return (
-            "a group takes the name of one of its choices, as likelihood=f_measure, and no null, "
-            "number or list; of experiment, none is no experiment"
+            "a group takes the name of one of its choices, as likelihood=f_measure, not null, a "
+            "number or a list; experiment=none means no experiment"
         )
     name = type(error).__name__ + (f": {text}" if text else "") + place_of(error)
     return f"unexpected {name} ({FULL_ERROR}=1 shows the traceback)"
@@ -118,8 +118,8 @@ def _of_system(error: OSError) -> str:
         return f"{file}{reason}{place} ({FULL_ERROR}=1 shows the traceback)"
     if error.filename is None:
         return (
-            f"{reason}; free what is needed, or have standard output, or the files of a run "
-            "(hydra.run.dir=DIR), go elsewhere"
+            f"{reason}; free what is needed, or send standard output, or the files of a run "
+            "(hydra.run.dir=DIR), elsewhere"
         )
     return (
         f"'{os.fsdecode(error.filename)}' cannot be read or written ({reason}); check the path and "

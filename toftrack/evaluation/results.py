@@ -99,7 +99,7 @@ def result_of(rows: Sequence[Row]) -> dict[str, Any]:
 
 def read_rows(path: Path) -> list[Row]:
     """The rows of an earlier measurement; ToftrackError where the file is none."""
-    what = f"'{path}', to compare with, is nothing that toftrack benchmark accuracy --json wrote"
+    what = f"--compare '{path}' is no file that toftrack benchmark accuracy --json wrote"
     with reported_errors(what, "give such a file", OSError, ValueError):
         content = read_json(path)
         rows = content.get("rows") if isinstance(content, dict) else None
@@ -128,9 +128,9 @@ def checked_targets(*paths: Path | None) -> None:
         with reported_errors(f"'{path}' cannot be written", "give another name"):
             check_replaceable(path)
             if not os.access(path.absolute().parent, os.W_OK):
-                raise OSError("it lies in no folder that is there and may be written")
+                raise OSError("its folder does not exist, or is read-only")
             if path.exists() and not os.access(path, os.W_OK):
-                raise OSError("it may only be read")
+                raise OSError("it is read-only")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -50,7 +50,7 @@ def read_poses(path: str | Path) -> list[NamedPose]:
     if reader is None:
         raise ToftrackError(f"{path} is neither .json nor .csv; give gestures.file=FILE as one")
     what = f"{path} cannot be read as a file of gestures"
-    with reported_errors(what, "give gestures.file=FILE", OSError, ValueError, csv.Error):
+    with reported_errors(what, "give another gestures.file", OSError, ValueError, csv.Error):
         units, rows = reader(path)
     if not rows:
         raise ToftrackError(f"{path} names no pose")

@@ -55,9 +55,9 @@ def kind_of_space(kind: str, of_file: str | None = None) -> type[PoseSpace]:
         space = named_object(kind, "pose_space.kind")
     else:
         known = ", ".join((*KINDS, *others))
-        what = f"{of_file} holds a pose space of the" if of_file else "pose_space"
+        what = f"{of_file}: the pose space" if of_file else "the pose space"
         raise ToftrackError(
-            f"{what} kind {kind!r}, which is not there; there are {known}, and your own by"
+            f"{what} kind {kind!r} is unknown; known are {known}, and your own as"
             " pose_space.kind=MODULE.CLASS (docs/extending.md)"
         )
     if not (isinstance(space, type) and issubclass(space, PoseSpace)):

@@ -177,7 +177,7 @@ def _check_option(word: str) -> None:
     if not word.startswith(_SHORT) and not any(o.startswith(word) for o in _LONG):
         raise ToftrackError(
             f"there is no option {word}; settings are given as KEY=VALUE, without dashes and "
-            "blanks, and --help tells which"
+            "blanks, and --help lists them"
         )
 
 

@@ -146,7 +146,7 @@ def _options(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpa
 def _seeds(text: str) -> list[int]:
     seeds = list(dict.fromkeys(part.strip() for part in text.split(",")))
     if not all(map(str.isdecimal, seeds)):
-        raise argparse.ArgumentTypeError(f"'{text}' is no whole numbers from 0 on, as 0,1,2")
+        raise argparse.ArgumentTypeError(f"'{text}' must be whole numbers from 0 on, as 0,1,2")
     return list(map(int, seeds))
 
 

@@ -102,9 +102,9 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
     places = sorted(spread, key=lambda at: abs(at - len(numbers) / 2))
     if not any(calibration.shows_board(_amplitude(store, numbers[at]), board) for at in places):
         raise ToftrackError(
-            f"no {board[0]}x{board[1]} chequerboard was seen in {len(places)} frames all over the "
-            "recording; it must be wholly in view, and --board its inner corners, columns x rows "
-            "(a board of 8x6 squares is 7x5)"
+            f"no {board[0]}x{board[1]} chequerboard was seen in any of {len(places)} frames over "
+            "the recording; it must be wholly in view, and --board is its inner corners, columns x "
+            "rows (a board of 8x6 squares is 7x5)"
         )
     views: list[View] = []
     for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):

@@ -79,7 +79,7 @@ def run(main: Callable[[], object]) -> int:
         return shutdown.exit_status(end)
     except SystemExit as end:  # of Hydra's options, as --help, and of its argument parser
         if place := place_of(end):
-            print(f"error: a part that is not toftrack's ended it{place}", file=sys.stderr)
+            print(f"error: a part that is not toftrack's ended the program{place}", file=sys.stderr)
             return 1
         if isinstance(end.code, str):
             print(end.code, file=sys.stderr)

@@ -92,7 +92,7 @@ def draw_figures(
         bar = tqdm(drawn, unit=" figures", file=sys.stderr, delay=1.0, leave=False)
         written = write_figures(target, bar)
     if not written:
-        raise ToftrackError("no figure could be drawn; why, the notes above say")
+        raise ToftrackError("no figure could be drawn; the notes above say why")
     return written
 
 

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_intermixed_args(arguments)
     path = Path(options.file).expanduser()
     if path.suffix.lower() != ".json":
-        raise ToftrackError(f"--file {path} is no .json, which is the kind that can be written")
+        raise ToftrackError(f"--file {path} is no .json, the only kind that can be written")
     poses = read_poses(path) if path.exists() else []
     words = options.words
     if options.command == "list" and not words:
@@ -59,13 +59,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         _remove(path, poses, words[0])
     elif options.command == "add" and len(words) >= 2:
         if options.begin is None or options.end is None:
-            raise ToftrackError("say which part of the recording it is: --from 2.0 --to 3.0")
+            raise ToftrackError("say which part of the recording shows it: --from 2.0 --to 3.0")
         name, recording, *overrides = words
         part_s = options.begin, options.end
         _add(path, poses, name, recording, part_s, options.replace, overrides)
     else:
         raise ToftrackError(
-            f"'{' '.join((options.command, *words))}' is not complete or too much; give"
+            f"'{' '.join((options.command, *words))}' has too few or too many words; give"
             " add NAME RECORDING --from 2.0 --to 3.0, list, or remove NAME"
         )
 
@@ -113,7 +113,7 @@ def _track(
     if not 0 <= begin_s < end_s < math.inf:
         raise ToftrackError(
             f"--from {begin_s:g} --to {end_s:g} is no part of a recording; give seconds from its"
-            " beginning, the later ones last"
+            " beginning, with --to after --from"
         )
     rows = np.flatnonzero((times >= begin_s) & (times <= end_s))
     if end_s > times[-1] + 1 / frames.fps or not len(rows):
@@ -138,11 +138,10 @@ def _check_name(name: str, taken: Sequence[str], replace: bool) -> None:
     if not name.strip() or name != name.strip() or not name.isprintable():
         raise ToftrackError(f"{name!r} is no name for a gesture; give a word, as 'peace'")
     if name == OTHER:
-        raise ToftrackError(f"'{OTHER}' is what is none of the gestures; give another name")
+        raise ToftrackError(f"'{OTHER}' means none of the gestures; give another name")
     if name in taken and not replace:
         raise ToftrackError(
-            f"there is a gesture '{name}' already; give another name, or --replace to have the new"
-            " one in its place"
+            f"there is a gesture '{name}' already; give another name, or --replace to replace it"
         )
 
 
@@ -169,4 +168,4 @@ def _remove(path: Path, poses: Sequence[NamedPose], name: str) -> None:
         save_poses(path, left)
     else:  # a file that names no pose is none of gestures
         path.unlink()
-    print(f"{path}: without {name}")
+    print(f"{path}: {name} removed")

@@ -144,7 +144,7 @@ class Tracking:
 def _scratch_folder() -> Iterator[Path]:
     """A folder that is gone afterwards, but for that of a run which says how to recover it."""
     remedy = "set TMPDIR to a folder that can be written"
-    with reported_errors("there is no place for the results meanwhile", remedy):
+    with reported_errors("there is no temporary folder for the results", remedy):
         folder = Path(tempfile.mkdtemp(prefix="toftrack-"))
     with ExitStack() as stack:
         stack.callback(shutil.rmtree, folder, ignore_errors=True)

@@ -54,8 +54,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     suffix = Path(options.out).suffix.lower()
     if suffix not in (".npz", ".srs"):
         raise ToftrackError(
-            f"a camera is recorded to .npz, or an SR3000 to .srs, not to '{options.out}'; convert "
-            "that afterwards with toftrack convert"
+            f"a camera is recorded to .npz, or an SR3000 to .srs, not to '{options.out}'; record "
+            "to one of these, and convert it with toftrack convert"
         )
     config = _configuration(options, raw=suffix == ".srs")
     if options.limit is None:
@@ -142,8 +142,8 @@ def _record_raw(device: Sr3000, options: argparse.Namespace) -> None:
                 break
             if writer.size_bytes >= 1e9 * options.limit:
                 print(
-                    f"the recording '{options.out}' ends after {writer.frames} frames: it has "
-                    f"{options.limit:g} GB, its limit",
+                    f"the recording '{options.out}' ends after {writer.frames} frames: it reached "
+                    f"its limit, {options.limit:g} GB",
                     file=sys.stderr,
                 )
                 break

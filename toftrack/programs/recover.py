@@ -95,12 +95,14 @@ def recover(
 def _check_not_less(folder: Path, frames: int) -> None:
     """ToftrackError where there is a track.npz that has more frames, or that cannot be read."""
     path, there = folder / "track.npz", 0
-    hint = "nothing was changed; --replace makes it anew of the lines all the same"
+    hint = "nothing was changed; with --replace it is made anew from the lines"
     try:
         if path.exists():
             there = len(read_results(path)["lost"])
     except ToftrackError:
-        what = f"there is a '{path}' that is damaged, or no run's, and {LINES} has {frames} frames"
+        what = (
+            f"there is a '{path}' that is damaged or not a run's, and {LINES} has {frames} frames"
+        )
         raise ToftrackError(f"{what}; {hint}") from None
     if there > frames:
         raise ToftrackError(f"'{path}' has {there} frames, but {LINES} only {frames}; {hint}")

@@ -291,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         " `toftrack benchmark accuracy --compare`."
     )
     parser = Parser(prog="toftrack report", description=about)
-    about = "of the sweep, multirun/DATE/TIME; to compare two runs, move both into one folder"
+    about = "that of the sweep, multirun/DATE/TIME, or one into which you moved runs to compare"
     parser.add_argument("folder", nargs="+", help=about)
     about = (
         "a figure of summary.json, as metrics.fingertip_mm; default metrics.mean_mm, the mean joint"

@@ -347,7 +347,7 @@ def _opening(metadata: dict[str, Any], device: Device) -> str:
     else:
         other = "left" if side == "right" else "right"
         what = f"a {side} hand (hand.side={other} for the other), its length"
-    fitted = "to be fitted from" if shape["fitted"] else "of"
+    fitted = "to be fitted, beginning with" if shape["fitted"] else "of"
     return f"tracking {source} ({count}): {what} {fitted} {1e3 * shape['hand_length_m']:.0f} mm"
 
 

@@ -66,7 +66,7 @@ def train(config: DictConfig) -> float:
     most = min(len(data) - 2, 21)
     wanted = [number for number in config.compare if number <= most]
     if left := [number for number in config.compare if number > most]:
-        say(f"left out of the table: {left} dimensions; {most} are the most that can be learned")
+        say(f"left out of the table: {left} dimensions; at most {most} can be learned")
     rows = _table(kind, sorted({*wanted, dims}), data, settings)
     say(errors_table(rows))
     if rows[0].variance is not None and [s["data"] for s in data.sources] == ["synthetic"]:

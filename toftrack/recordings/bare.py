@@ -49,7 +49,7 @@ class Given:
         if self.intrinsics is not None and self.camera_file is not None:
             raise ToftrackError(
                 "camera.file and device.intrinsics (toftrack convert: --camera and --intrinsics) "
-                "both tell the lens; leave one out"
+                "both give the lens; leave one out"
             )
 
     def camera(self, width: int, height: int, images: str) -> Camera | None:
@@ -112,5 +112,5 @@ def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:
     median = median_reading(depth_m)
     if median > LARGEST_MEDIAN_M:
         raise ToftrackError(
-            f"the median of {what} is {median:.0f} m, which is plainly another unit{remedy}"
+            f"the median of {what} is {median:.0f} m, which is plainly in another unit{remedy}"
         )

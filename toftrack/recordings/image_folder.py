@@ -110,7 +110,7 @@ class ZippedFiles(Files):
         with broken_is_value_error():
             entry = self._opened().getinfo(name)
             if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-                raise ValueError("its compression is not read; zip it in the usual way")
+                raise ValueError("its compression is unknown; zip it in the usual way")
             return self._opened().open(entry)
 
     def read(self, name: str, most_bytes: int | None = None) -> bytes:

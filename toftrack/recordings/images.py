@@ -154,7 +154,7 @@ def decoded_depth(content: bytes) -> np.ndarray:
     if content.startswith(SIGNATURE):
         image = decoded_png(content)
     elif len(pages) > 1 and len(set(pages)) == 1:
-        raise ValueError(f"it is a stack of {len(pages)} images, which is a recording: give it")
+        raise ValueError(f"it is a stack of {len(pages)} images: give it by itself")
     elif pages:
         try:
             image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -184,7 +184,7 @@ def _decoded_exr(content: bytes) -> np.ndarray:
     if read[0].shape != (height, width):
         raise ValueError("it is damaged")
     if not all(np.array_equal(one, read[0], equal_nan=True) for one in read):
-        raise ValueError("it is of colours")
+        raise ValueError("it is a colour image")
     return read[0].astype(np.float32)
 
 

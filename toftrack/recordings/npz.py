@@ -79,8 +79,8 @@ class StreamedImages:
         self._path, self._name = path, name
         if header.fortran_order or header.kind.kind not in "fiu":
             raise ToftrackError(
-                f"'{name}' of the recording '{path}' has {header.size / 1e9:.1f} GB, and can be "
-                "read in turn only as numbers in C order; save it so (numpy.ascontiguousarray)"
+                f"'{name}' of the recording '{path}' has {header.size / 1e9:.1f} GB; so large an "
+                "array must be numbers in C order: save it with numpy.ascontiguousarray"
             )
         self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
         self._images: Generator[np.ndarray] | None = None
@@ -247,7 +247,7 @@ def _read_archive(path: Path, archive: Archive) -> dict[str, Images]:
     images = {name for name in _IMAGES if name in headers}
     others = sum(headers[name].size for name in headers.keys() & set(_KEYS) - images)
     if others > MOST_BYTES:
-        raise ValueError(f"beside its images it holds {others / 1e9:.1f} GB")
+        raise ValueError(f"besides its images it holds {others / 1e9:.1f} GB")
     if sum(headers[name].size for name in images) <= LOADED_BYTES:
         images.clear()
     return {

@@ -154,7 +154,7 @@ class Recorder:
             self._end(reason, failed=True)
         else:
             if self._file.bytes >= self._limit_gb * _GIGABYTE:
-                self._end(f"it has {self._limit_gb:g} GB, its limit", failed=False)
+                self._end(f"it reached its limit, {self._limit_gb:g} GB", failed=False)
             elif not space:
                 self._end("the disk is nearly full", failed=False)
 

@@ -107,7 +107,9 @@ class RosBag(FrameStore):
         try:
             _, message = next(self._messages)
         except StopIteration:
-            raise ToftrackError(f"'{self.path}' ended while it was read; is it copied?") from None
+            raise ToftrackError(
+                f"'{self.path}' ended while it was read; is it still being copied?"
+            ) from None
         self._next = index + 1
         depth = self._metres(message, index)
         if depth.shape != (self.camera.height, self.camera.width):
@@ -167,8 +169,8 @@ class _Bag:
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise ToftrackError(
-                f"'{path}' is read by rosbags ({error}): pip install 'toftrack[ros]' (recordings "
-                "of cameras' own programs: device=realsense or orbbec, device.bag=FILE)"
+                f"'{path}' is read by rosbags ({error}): pip install 'toftrack[ros]' (or, if a "
+                "camera's own program wrote it, device=realsense or orbbec with device.bag=FILE)"
             ) from error
         # The messages that are read are the same in every release of ROS 2.
         store = types.Stores.ROS1_NOETIC if self._is_one else types.Stores.ROS2_HUMBLE
@@ -233,7 +235,7 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
             if topic.name == "/" + wanted.strip("/") or topic.name == wanted:
                 return topic
         raise ToftrackError(
-            f"'{bag.path}' has no images of the topic {wanted}; its topics of images are "
+            f"'{bag.path}' has no images of the topic {wanted}; its image topics are "
             f"{_listed(images)}"
         )
     depth = [topic for topic in images if is_depth(topic.encoding)]
@@ -242,13 +244,13 @@ def _choose(bag: _Bag, wanted: str | None) -> _Topic:
     depth = [topic for topic in depth if topic.kind == IMAGE or topic.base not in raw]
     if not depth:
         raise ToftrackError(
-            f"'{bag.path}' has no depth images (16UC1, 32FC1, or compressedDepth); its topics of "
-            f"images are {_listed(images)}"
+            f"'{bag.path}' has no depth images (16UC1, 32FC1, or compressedDepth); its image "
+            f"topics are {_listed(images)}"
         )
     if len(depth) > 1:
         raise ToftrackError(
             f"'{bag.path}' has {len(depth)} topics of depth images; choose one with device=rosbag "
-            f"device.topic= (toftrack convert: --topic): {_listed(depth)}"
+            f"device.topic=TOPIC (toftrack convert: --topic): {_listed(depth)}"
         )
     return depth[0]
 

@@ -186,7 +186,7 @@ class _Hdf5:
             if found.nbytes > max(_SMALL_BYTES, _MOST_RATIO * stored) or (
                 max(chunk, math.prod(found.shape[-2:])) * found.dtype.itemsize > _MOST_CHUNK_BYTES
             ):
-                raise ValueError(f"it would make {found.nbytes / 1e6:.0f} MB of {stored} bytes")
+                raise ValueError(f"it would unpack {stored} bytes to {found.nbytes / 1e6:.0f} MB")
             self.shape = (1, *found.shape)[-3:]
             self.dtype = found.dtype
 

@@ -116,7 +116,7 @@ def _opened(path: str | Path, given: Given) -> FrameStore:
         with reading(file_of(path)), open_to_read(path) as stream:
             if stream.read(2) != b"PK":
                 kind = f"that end with {suffix}" if suffix else "without an ending"
-                raise ToftrackError(f"'{path}' is not read, as are no files {kind}; give {_READ}")
+                raise ToftrackError(f"'{path}' is not read, nor are any files {kind}; give {_READ}")
     return read_recording(path, given)
 
 

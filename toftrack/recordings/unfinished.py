@@ -171,7 +171,7 @@ def recover_recording(path: Path, overwrite: bool = False) -> tuple[Path, int]:
     if not os.path.lexists(part):
         raise ToftrackError(
             f"there is no '{part}', so there is nothing to recover; give what `toftrack record` or "
-            "record=FILE left, FILE.npz.part (a .srs needs nothing)"
+            "record=FILE left, FILE.npz.part (a .srs needs no recovery)"
         )
     target = part.with_name(part.name.removesuffix(SUFFIX))
     return target, finish(part, target, overwrite)

@@ -169,5 +169,5 @@ def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
         return found
     raise ToftrackError(
         f"likelihood: {type(likelihood).__name__}.score gives {found.tolist()} where correct is"
-        f" {counts.correct.tolist()}; let it give (N,) numbers of 0 to 1, and 0 where that is 0"
+        f" {counts.correct.tolist()}; it must give (N,) numbers of 0 to 1, and 0 where that is 0"
     )

@@ -425,7 +425,7 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
         joints = JointConfidence(**content["joints"])
     except (OSError, ValueError, TypeError, KeyError, AttributeError, ToftrackError) as error:
         raise ToftrackError(
-            f"lost.fitted='{path}' is no confidence that was fitted ({error}); give a file of"
+            f"lost.fitted='{path}' is no file of a fitted confidence ({error}); give a file of"
             " python -m toftrack.training fit-confidence, or leave it out"
         ) from None
     return ConfidenceModel(**thresholds, log_odds=log_odds, whole_odds=whole_odds, joints=joints)

@@ -52,7 +52,7 @@ class HandsTracker:
         check_number("hands", hands, 1, MOST_HANDS, whole=True)
         if hands > 1 and not model.detects:
             raise ToftrackError(
-                f"hands={hands} tells hands apart by the networks, but experiment=paper has none;"
+                f"hands={hands} needs networks to tell hands apart, and experiment=paper has none;"
                 " give hands=1, or leave experiment=paper out"
             )
         self.model, self.time = model, Timekeeper(pace, clock)

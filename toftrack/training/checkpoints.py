@@ -125,8 +125,8 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
         for name, value in settings.items():
             if before[name] != value:
                 raise ToftrackError(
-                    f"{path} is a checkpoint of a training with {name}={before[name]}, and now it"
-                    f" is {value}; give the same, or train without resume"
+                    f"{path} is a checkpoint of a training with {name}={before[name]}, but now"
+                    f" {name}={value}; give the same, or train without resume"
                 )
         for name in _STATES:
             getattr(progress, name).load_state_dict(content[name])

@@ -290,9 +290,9 @@ def _check_length(name: str, progress: Progress, schedule: Schedule) -> None:
     meant = replace(schedule, images=progress.images)
     if meant.steps != schedule.steps and progress.step > _STEADY * min(meant.steps, schedule.steps):
         raise ToftrackError(
-            f"of the {progress.images} images of {counted} {progress.step * schedule.batch} have"
-            f" been seen: the rate falls, or would have to already, so that {counted} cannot become"
-            f" {schedule.images} any more; give {progress.images}"
+            f"{counted} can no longer change from {progress.images} to {schedule.images}: after"
+            f" {progress.step * schedule.batch} images the rate is falling, or would have to be"
+            f" already; give {counted}={progress.images}"
         )
     progress.images = schedule.images
 

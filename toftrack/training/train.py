@@ -52,15 +52,15 @@ def train(config: DictConfig) -> float:
     missing = missing_packages()
     if missing:
         print(
-            f"{needed(missing)}; otherwise training ends with {config.output} alone, and they are"
-            f" made later by {COMMAND} {path}"
+            f"{needed(missing)}; otherwise training writes only {config.output}, and {COMMAND}"
+            f" {path} makes them later"
         )
     found = "cuda" if torch.cuda.is_available() else "cpu"
     device = compute_device(found if config.compute == "auto" else config.compute)
     if path.suffix != ".npz" or not path.parent.is_dir():
         raise ToftrackError(
             f"output={config.output} is not possible; give a name that ends in .npz, in a folder "
-            "that there is"
+            "that exists"
         )
     poses, finder = (_schedule(config, name) for name in ("poses", "finder"))
     for schedule in (poses, finder):

@@ -58,7 +58,7 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
         fits = [fit_angles(clips[i], shape_of_joints(clips[i], shape, yaw)) for i in kept]
     except torch.linalg.LinAlgError:
         raise ToftrackError(
-            f"the joint positions of {path} are those of no hand; are they in millimetres?"
+            f"the joint positions of {path} do not make a hand; are they in millimetres?"
         ) from None
     angles = torch.cat([fit.angles_rad for fit in fits])
     error_mm = 1e3 * torch.cat([fit.error_m for fit in fits])

@@ -70,13 +70,13 @@ def in_radians(path: str | Path, angles: np.ndarray, units: str | None, say: str
     # No joint bends by more than 2.1 rad, and no collection of hands stays within 2.1 degrees.
     if units == "radians" and largest > 4.0:
         raise ToftrackError(
-            f"{path} has angles up to {largest:.1f} and is said to be in radians, which no joint"
-            f" reaches; if they are degrees {say.format('degrees')}"
+            f"{path} has angles up to {largest:.1f}, but is said to be in radians, which no joint"
+            f" reaches; if they are degrees, {say.format('degrees')}"
         )
     if units == "degrees" and 0 < largest < 3.0:
         raise ToftrackError(
-            f"{path} has no angle above {largest:.2f} and is said to be in degrees, so that the"
-            f" hand would hardly move; if they are radians {say.format('radians')}"
+            f"{path} has no angle above {largest:.2f}, but is said to be in degrees, so that the"
+            f" hand would hardly move; if they are radians, {say.format('radians')}"
         )
     return np.radians(angles) if units == "degrees" else angles
 
@@ -169,7 +169,7 @@ def _read_csv(path: str) -> _Content:
 def _read_npz(path: str) -> _Content:
     content = read_archive(path)
     if {"state", "lost"} <= content.keys():
-        raise ToftrackError(f"{path} is of a run; give data=run data.path={path}")
+        raise ToftrackError(f"{path} was written by a run; give data=run data.path={path}")
     if "angles" not in content:
         raise ToftrackError(f"{path} has no array 'angles' of (poses, {len(ANGLE_NAMES)})")
     angles = content["angles"]
@@ -213,8 +213,8 @@ def run_data(path: str, poses: int | None, confidence: float) -> PoseData:
     angles = states[kept][:, 6:].astype(np.float64)
     if len(angles) < 2:
         raise ToftrackError(
-            f"the run {place} has {len(angles)} frames that are not lost and at least"
-            f" {confidence:g} sure, of {len(kept)}; give a longer recording, or a smaller"
+            f"of the {len(kept)} frames of the run {place}, {len(angles)} are not lost and at"
+            f" least {confidence:g} sure; give a longer recording, or a smaller"
             " data.confidence"
         )
     radians, note = _within_limits(place, angles)
