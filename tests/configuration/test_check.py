@@ -36,7 +36,7 @@ WRONG = [
     ("gestures.pinch=null", "it has settings of its own; give these, as gestures.pinch.touching="),
     ("likelihood=3", "a group takes the name of one of its choices"),
     ("hand=[1,2]", "a group takes the name of one of its choices"),
-    ("experiment=null", "of experiment, none is no experiment"),
+    ("experiment=null", "experiment=none means no experiment"),
     ("filter.spread.depth_m=1e30", "give a number of at least 0 and at most 10"),
     # What was probably meant.
     ("hand.sied=left", "there is no setting hand.sied; did you mean hand.side?"),

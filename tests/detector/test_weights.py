@@ -52,7 +52,7 @@ def rewritten(path: Path, **changes: object) -> None:
 def refused(path: Path, words: str) -> None:
     with pytest.raises(ToftrackError, match=words) as error:
         load_weights(path)
-    assert "\n" not in str(error.value) and "train them anew" in str(error.value)
+    assert "\n" not in str(error.value) and "give other detector.weights" in str(error.value)
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
 """Channels; ten times those of the package's networks."""
-_AGAIN = "train them anew with python -m toftrack.training train, or install again"
+_AGAIN = "give other detector.weights, train with python -m toftrack.training train, or reinstall"
 
 
 def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:

@@ -88,7 +88,7 @@ def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Sti
     any that is visible. Raises ToftrackError, one sentence that names the file."""
     what = f"the labels '{path}' are of neither kind that {__name__} describes"
     damaged = KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError
-    with reported_errors(what, "give points or stills", *damaged):
+    with reported_errors(what, "give labels of points or of stills", *damaged):
         return _parsed(path, content, begun)
 
 

@@ -151,10 +151,10 @@ def _seeds(text: str) -> list[int]:
 
 
 def _workers(text: str) -> int:
-    count = int(text)
-    if not 1 <= count <= 4 * (os.cpu_count() or 1):
-        raise ValueError
-    return count
+    most = 4 * (os.cpu_count() or 1)
+    if not (text.isdecimal() and 1 <= int(text) <= most):
+        raise argparse.ArgumentTypeError(f"'{text}' must be a whole number from 1 to {most}")
+    return int(text)
 
 
 def _write_picture(path: Path, result: dict[str, Any]) -> None:

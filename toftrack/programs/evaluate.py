@@ -56,10 +56,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _count(text: str) -> int:
-    count = int(text)
-    if count < 1:
-        raise ValueError
-    return count
+    if not (text.isdecimal() and int(text) > 0):
+        raise ToftrackError(f"--frames {text} must be a whole number above 0")
+    return int(text)
 
 
 def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[LabelledSequence]:
