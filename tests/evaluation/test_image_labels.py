@@ -101,5 +101,5 @@ def test_a_still_may_have_several_names_and_other_is_no_wrong_one(tmp_path) -> N
     ],
 )
 def test_labels_of_neither_kind_are_reported_in_one_sentence(tmp_path, content) -> None:
-    with pytest.raises(ToftrackError, match="labels '.*' are of neither kind"):
+    with pytest.raises(ToftrackError, match="labels '.*' are neither of points nor of stills"):
         labels(tmp_path, content)

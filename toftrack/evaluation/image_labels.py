@@ -86,9 +86,11 @@ def read_labels(path: str | Path) -> Points | Stills:
 def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
     """Labels of either kind as they stand in a file; where `begun`, points may still be without
     any that is visible. Raises ToftrackError, one sentence that names the file."""
-    what = f"the labels '{path}' are of neither kind that {__name__} describes"
+    what = f"the labels '{path}' are neither of points nor of stills"
     damaged = KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError
-    with reported_errors(what, "give labels of points or of stills", *damaged):
+    with reported_errors(
+        what, "give a file that toftrack label made (or see docs/accuracy.md)", *damaged
+    ):
         return _parsed(path, content, begun)
 
 

@@ -251,7 +251,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
         ) from error
     except KeyError as error:
         raise ToftrackError(
-            f"'{path}' is not a track.npz of this toftrack (it has no '{error.args[0]}'); give one"
+            f"'{path}' is not a track.npz of this toftrack (it has no "
+            f"'{error.args[0]}'); track again, or use the version that made it"
         ) from None
     except (ValueError, TypeError, AttributeError) as error:
         raise ToftrackError(

@@ -40,8 +40,10 @@ def _speed(arguments: Sequence[str]) -> None:
     parser = plain_parser("toftrack benchmark", speed.__doc__)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     counts = list(speed.PARTICLES)
-    parser.add_argument("--particles", type=int, nargs="+", default=counts, metavar="N")
-    parser.add_argument("--compute", choices=("cpu", "cuda"), default="cpu")
+    about = f"how many hypotheses to time ({' '.join(map(str, counts))})"
+    parser.add_argument("--particles", type=int, nargs="+", default=counts, metavar="N", help=about)
+    about = "device that scores (cpu)"
+    parser.add_argument("--compute", choices=("cpu", "cuda"), default="cpu", help=about)
     about = "how long to time each method (1)"
     parser.add_argument("--seconds", type=float, default=1.0, help=about)
     parser.add_argument("--frames", action="store_true", help="time whole frames, too")
@@ -65,7 +67,8 @@ def _alternating(arguments: Sequence[str]) -> None:
     )
     parser.add_argument("--starts", type=int, default=0, help="starts to time (0)")
     parser.add_argument("--cores", type=int, help="how many all may use, if it can be set")
-    parser.add_argument("--two-hands", nargs="+", default=[], metavar="RECORDING")
+    about = "recordings with truth of two hands"
+    parser.add_argument("--two-hands", nargs="+", default=[], metavar="RECORDING", help=about)
     parser.add_argument("--peer-python", metavar="PYTHON", help="Python of MediaPipe's environment")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     given = parser.parse_args(arguments)

@@ -148,7 +148,7 @@ def finish(part: Path, path: Path, overwrite: bool = False) -> int:
             if not overwrite and os.path.lexists(path):
                 raise ToftrackError(
                     f"the file '{path}' exists already, and '{part}' is another recording; rename "
-                    "one of them, or give --replace"
+                    f"one of them, or `toftrack recover {part} --replace`"
                 )
             with whole_file(path) as target:
                 _make_npz(target, stream, facts, frames)
