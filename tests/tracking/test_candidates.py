@@ -7,13 +7,29 @@ import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
-from helpers.rendered import bent, hand_at, image_of, right_hand_model, track_of, view_of
+from helpers.rendered import (
+    bent,
+    hand_at,
+    image_of,
+    right_hand_model,
+    state_of,
+    track_of,
+    view_of,
+)
 from helpers.settings import refinement
 
+from toftrack.compute.pace import FRAME_S
 from toftrack.detector.crops import crop_rotation
 from toftrack.detector.detection import Detection
 from toftrack.detector.network import PARTS
-from toftrack.detector.parts import BACKGROUND_PART, FOREARM_PART, HAND_PART, THING_PART, Parts
+from toftrack.detector.parts import (
+    ALL_HAND,
+    BACKGROUND_PART,
+    FOREARM_PART,
+    HAND_PART,
+    THING_PART,
+    Parts,
+)
 from toftrack.hand.shape import default_hand_shape
 from toftrack.refinement.shape_fit import first_shape, with_network_length
 from toftrack.render.segmentation import Observation
@@ -30,6 +46,8 @@ from toftrack.tracking.candidates import (
     without_things,
 )
 from toftrack.tracking.model import TrackerModel
+from toftrack.tracking.state import SideEvidence
+from toftrack.tracking.step import step
 
 
 def model_with(**settings: float) -> TrackerModel:
@@ -166,6 +184,18 @@ def test_what_was_a_thing_at_the_last_look_is_left_out_until_the_next() -> None:
     assert torch.equal(seen.hand, rest.hand) and torch.equal(seen.thing, rest.thing)
     plain = view_of(image_of(hand_at()), track_of(hand_at()))
     assert with_parts(plain) is plain
+
+
+def test_a_frame_that_the_network_does_not_look_at_is_told_apart_by_its_last_look() -> None:
+    known = {"parts": parts_of(HALF_A_THING), "evidence": SideEvidence(age_s=0.0)}
+    image = replace(image_of(hand_at()), timestamp_s=FRAME_S)
+    weights = []
+    for changes in (known, known | {"parts": ALL_HAND}):
+        _, (info,), _ = step(state_of(track_of(hand_at(), **changes)), image, model_with(every=3))
+        assert info is not None and info.detection is None
+        assert (info.observation.thing is None) == (changes["parts"] is ALL_HAND)
+        weights.append(info.weights)
+    assert not torch.equal(*weights), "the filter goes by it as well"
 
 
 def test_without_a_thing_all_stays_as_it_is() -> None:
