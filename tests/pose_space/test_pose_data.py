@@ -301,7 +301,7 @@ def test_the_command_trains_on_a_users_file_and_records_it(
     assert status == 0, err
     assert "learning spaces for the table of errors" in err and "2/2" in err
     assert "40 training poses" in printed and " deg," in printed
-    assert "left out of the table: [30] dimensions; 21 are the most" in printed
+    assert "left out of the table: [30] dimensions; at most 21" in printed
     assert load_pose_space(out / "pose_space.npz").dims == 2
     header = json.loads(str(np.load(out / "pose_space.npz")["header"]))
     assert header["sources"][0]["file"] == "mine.csv"

@@ -43,10 +43,11 @@ from toftrack.tracking.state import (
 _OTHER = 0.4
 """A hand that is of the side that the user said with less than this probability is flagged as
 another one."""
-_STAYS, _CONFIRMED, _MOST = 2.0, 6.0, 3.0
-"""Worth of a track to a slot, log odds: for being there before, for being confirmed, and, at most,
-for its log odds and for its side. With 4 for being there, an elbow kept the only slot after
-something had hidden the hand."""
+_STAYS, _CONFIRMED = 2.0, 6.0
+"""What a track is worth to a slot, in log odds, for being there before and for being confirmed.
+With 4 for being there, an elbow kept the only slot after something had hidden the hand."""
+_MOST = 3.0
+"""A track's log odds, and those of its side, count up to this either way."""
 _GONE_S = 2.0
 """Where no side was said, a hand of the other side takes the only slot when none was believed there
 for so long."""
@@ -112,24 +113,24 @@ def assign_slots(
 
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
     """A track's worth to slot `number`; 0 or less where it may not take it.  right: log odds."""
-    several, wanted = len(state.slots), side_of_slot(number, state)
+    count, wanted = len(state.slots), side_of_slot(number, state)
     # Where nobody said which hand is meant, tracks that are probably right are worth the same: the
     # first is the one held out (detect.held_out_first), another may just be seen better.
-    most = 0.0 if several == 1 and wanted is None and slot.known is None else _MOST
+    most = 0.0 if count == 1 and wanted is None and slot.known is None else _MOST
     worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), most) + _MOST
     stays = slot.track == track.number
     # Of hands that are worth the same, the one that was found first comes first.
     worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
-    if several > 2:
+    if count > 2:  # hands of several persons: sides say nothing
         return worth
     if wanted is not None:
         agrees = right if wanted == "right" else -right
-        return worth + min(max(agrees, -_MOST), _MOST) + (0 if several == 1 else _MOST)
+        return worth + min(max(agrees, -_MOST), _MOST) + (0 if count == 1 else _MOST)
     if slot.known is None or stays:
         return worth + 0.1
     agrees = right if slot.known == "right" else -right
-    if several == 1 and agrees < 0 and slot.away_s < _GONE_S:
-        return -1.0
+    if count == 1 and agrees < 0 and slot.away_s < _GONE_S:
+        return -1.0  # the hand that was there may come back
     return worth + 0.1 + 0.3 * min(max(agrees, -_MOST), _MOST)
 
 
