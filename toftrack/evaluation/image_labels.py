@@ -88,9 +88,8 @@ def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Sti
     any that is visible. Raises ToftrackError, one sentence that names the file."""
     what = f"the labels '{path}' are neither of points nor of stills"
     damaged = KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError
-    with reported_errors(
-        what, "give a file that toftrack label made (or see docs/accuracy.md)", *damaged
-    ):
+    remedy = "give a file of toftrack label in which a point was clicked (or see docs/accuracy.md)"
+    with reported_errors(what, remedy, *damaged):
         return _parsed(path, content, begun)
 
 

@@ -99,7 +99,7 @@ def _page(device: Device, config: DictConfig, path: Path, options: argparse.Name
     checked_targets(target)
     labels = LabelFile(target, path.name, (camera.width, camera.height), count, options.side)
     if device.truth is not None:
-        note = "has truth, by which the benchmark measures, and not by labels"
+        note = "holds truth; the benchmark measures by that, not by labels"
         print(f"note: '{path}' {note}", file=sys.stderr)
     known = track(device, config) if options.least_sure else None
     given = labels.numbers()
@@ -128,6 +128,8 @@ def ending(labels: LabelFile, path: Path, words: Sequence[str]) -> str:
         for word in (option, *given[key].strip("[]").replace(",", " ").split())
     ]
     lines = [f"{labels.path}: {labels.labelled()} of {len(labels.frames)} frames are labelled"]
+    if not labels.labelled():
+        return f"{lines[0]}; the same command continues"
     measured = path
     if options or path.suffix.lower() != ".npz":
         measured = Path(f"{path.stem or path.name}_to_measure.npz")
