@@ -233,7 +233,7 @@ def gestures_with(
             if different and _alike(gestures, own, other):
                 raise ToftrackError(
                     f"{source}: gestures {definitions[other].name!r} and {name!r} are too much"
-                    " alike to be told apart; give them one name, or angles that differ more"
+                    " alike to be told apart; give them one name, or poses that differ more"
                 )
     return gestures
 

@@ -91,7 +91,7 @@ def _accuracy(arguments: Sequence[str]) -> None:
     about = "handedness: told = given by the truth, auto = detected while tracking (told)"
     parser.add_argument("--side", choices=SIDES, default="told", help=about)
     hands = range(1, MOST_HANDS + 1)
-    parser.add_argument("--hands", type=int, choices=hands, default=1, help="followed at once (1)")
+    parser.add_argument("--hands", type=int, choices=hands, default=1, help="tracked at once (1)")
     about = "labels of a recording without truth; may be given several times"
     add = parser.add_argument
     add("--labels", type=Path, metavar="FILE", action="append", default=[], help=about)

@@ -2,17 +2,15 @@
 
 Writes five PNG files into the run's folder, below `figures`:
 
-| file | what |
-| --- | --- |
-| `measurement.png` | a frame's input, range image, neighbourhood, classified pixels (fig. 3) |
-| `filmstrip.png` | ten frames with the skeleton, and the estimates' range images (fig. 5) |
-| `lost.png` | frames that were lost, else those of the lowest score, with their scores (fig. 6) |
-| `course.png` | joint error against the truth, score and confidence over time |
-| `latent.png` | the path of the estimates over the training poses |
+  measurement.png   a frame's input, range image, neighbourhood, classified pixels (fig. 3)
+  filmstrip.png     ten frames with the skeleton, and the estimates' range images (fig. 5)
+  lost.png          frames that were lost, else those of the lowest score, with scores (fig. 6)
+  course.png        joint error against the truth, score and confidence over time
+  latent.png        the path of the estimates over the training poses
 
 The first three need the recording that the run tracked; a run with a live camera has none, so only
-the others are drawn. With several hands, the figures of the second slot are `measurement_2` and so
-on; the filmstrip shows all hands.
+the others are drawn. With several hands, the figures of the second slot are `measurement_2.png` and
+so on; the filmstrip shows all hands.
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ from toftrack.views.figures.runs import (
 def main(arguments: Sequence[str] | None = None) -> None:
     """Parse the command line and draw. Raises ToftrackError."""
     parser = plain_parser("toftrack figures", __doc__)
-    parser.add_argument("run", metavar="RUN_DIR", help="the output folder of track.py")
+    parser.add_argument("run", metavar="RUN_DIR", help="the output folder of toftrack track")
     parser.add_argument("--recording", metavar="FILE", help="where the recording is now")
     parser.add_argument("--out", metavar="DIR", help="write here instead of RUN_DIR/figures")
     about = "the frame of measurement.png (default: one with the median score)"

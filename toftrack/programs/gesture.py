@@ -101,7 +101,7 @@ def _add(
     gestures_with(known, with_it, gestures.settings, str(path))
     save_poses(path, with_it)
     print(f"{path}: {name}, from {int(believed.sum())} of {len(believed)} frames")
-    print(f"use it: python track.py gestures.file={path}")
+    print(f"use it: toftrack track gestures.file={path}")
 
 
 def _track(

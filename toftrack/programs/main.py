@@ -46,7 +46,7 @@ commands (toftrack COMMAND --help says more):
 _TRACK = f"""toftrack track follows a hand and writes joints, state and gesture of every frame.
 {_EXAMPLES}
 FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or another
-kind in docs/cameras.md. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
+kind in docs/formats.md. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
 Ctrl-C ends a run and keeps what was done. All other words are settings: KEY=VALUE, or
 GROUP=CHOICE from
 

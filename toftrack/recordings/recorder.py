@@ -131,7 +131,7 @@ class Recorder:
                     rest = f"`toftrack recover {path}` finishes it, or " * (path == self._part)
                     raise ToftrackError(
                         f"the file '{path}' exists already; {rest}choose another name, or "
-                        "(toftrack record) give --overwrite"
+                        "let toftrack record replace it with --overwrite"
                     )
         what = f"the recording '{self.path}' cannot be written"
         with reported_errors(what, "choose another place"):
