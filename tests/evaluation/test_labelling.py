@@ -11,6 +11,7 @@ from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, read_labels
 from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
+from toftrack.programs.label import ending
 
 ABSENT = [None, None, "absent"]
 
@@ -51,6 +52,9 @@ def test_every_change_is_in_the_file_and_the_benchmark_reads_it(tmp_path) -> Non
     labels.set_point(12, "index_tip", None)
     labels.set_gesture(12, None)
     assert labels.labelled() == 0 and "gesture" not in labels.frames["12"]
+    assert ending(labels, Path("a.npz"), ()).endswith(
+        "0 of 2 frames are labelled; the same command continues"
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["labels.json"]
 
 
