@@ -219,7 +219,8 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
     if mostly("out_of_reach"):
         found.append(
             f"Nothing was within segmentation.max_distance_m={reach_m:g}: hold the hand nearer, "
-            "or raise it; if the hand was nearer, the unit is wrong (device.unit_m)."
+            "or raise it; if the hand was nearer, the unit is wrong (an .npz is in metres; of "
+            "other recordings device.unit_m says it)."
         )
     if mostly("too_near"):
         found.append(

@@ -166,7 +166,7 @@ class Run:
             advice = advice[:1]  # rather than the hand, lost.score is wrong, which is said
         if advice[1:] and (doubts := self.device.description.get("doubts")):
             # What there is to try may contradict it: hold nearer what is of another unit.
-            advised = (f"If that is as it should be: {more}" for more in advice[1:])
+            advised = (f"If that is not the cause: {more}" for more in advice[1:])
             advice = advice[0], f"First look into this: {doubts[0]}", *advised
         return dropped + advice
 
