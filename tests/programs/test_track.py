@@ -16,6 +16,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -150,8 +151,8 @@ def test_the_file_of_a_hand_holds_the_one_whose_fit_rests_on_most_poses(tmp_path
         fitted = Fitted(("length",), (0.0,), ((0.01,),), poses, False) if poses else None
         return replace(default_hand_shape(length_m), fitted=fitted)
 
-    tracker = SimpleNamespace(states=[SimpleNamespace(track=-1)], fitted=(hand(0.19),))
-    files = _ShapeFiles(tmp_path, tracker)  # type: ignore[arg-type]
+    tracker: Any = SimpleNamespace(states=[SimpleNamespace(track=-1)], fitted=(hand(0.19),))
+    files = _ShapeFiles(tmp_path, tracker)
     for track, present, length_mm in (
         (0, hand(0.185), 185),
         (0, hand(0.179, 5.0), 179),
