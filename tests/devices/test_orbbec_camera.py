@@ -26,7 +26,7 @@ def a_camera(
     serial: str = "0042", numbers: tuple[int, ...] = (), infrared: str | None = IR
 ) -> FakeCamera:
     profiles = {DEPTH: [profile("y16"), profile("y16", fps=15), profile("y16", (16, 12))]}
-    profiles[DEPTH].append(profile("rle", (99, 99)))
+    profiles[DEPTH].append(profile("mjpg", (99, 99)))
     if infrared is not None:
         profiles[infrared] = [profile("y8", (16, 12)), profile("y8")]
     sets = [Images(image(n), image(n, np.uint8) if infrared else None) for n in numbers]
@@ -130,6 +130,15 @@ def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(
         orbbec(width=641)
     assert orbbec(fps=15).fps == 15
     assert orbbec(width=16, height=12).camera.width == 16
+
+
+@pytest.mark.parametrize("packed", ["rle", "y12"])
+def test_depth_that_the_sdk_unpacks_is_taken(plug: Plug, packed: str) -> None:
+    # All that a Gemini 2 (RLE, Y14) or an Astra Mini Pro (Y12) has; frames come as Y16.
+    camera = FakeCamera("1", {DEPTH: [profile(packed)]}, [Images(image(70))])
+    plug(camera)
+    (frame,) = orbbec(keep="every", stop=1)
+    np.testing.assert_allclose(frame.depth, np.full((6, 8), 70 * 0.25e-3))
 
 
 @pytest.mark.parametrize("model", ["brown_conrady", "brown_conrady_k6", None])

@@ -98,10 +98,11 @@ class Sdk(SimpleNamespace):
     def __init__(self, *cameras: Camera, start_error: str | None = None) -> None:
         models = ("none", "brown_conrady", "brown_conrady_k6", "kannala_brandt4")
         others = ("inverse_brown_conrady", "modified_brown_conrady")
+        formats = "y8 y10 y11 y12 y14 y16 z16 rle rvl mjpg"
         super().__init__(
             OBError=OBError,
             OBLogLevel=SimpleNamespace(NONE=5),
-            OBFormat=SimpleNamespace(Y16="y16", Z16="z16", Y8="y8"),
+            OBFormat=SimpleNamespace(**{name.upper(): name for name in formats.split()}),
             OBSensorType=SimpleNamespace(DEPTH_SENSOR=DEPTH, IR_SENSOR=IR, LEFT_IR_SENSOR=LEFT_IR),
             OBFrameType=SimpleNamespace(IR_FRAME="ir_frame", LEFT_IR_FRAME="left_ir_frame"),
             OBFrameAggregateOutputMode=SimpleNamespace(FULL_FRAME_REQUIRE=0),
