@@ -25,7 +25,9 @@ def plug(monkeypatch: pytest.MonkeyPatch, *ids: tuple[int, int]) -> None:
     [
         (((0x8086, 0x0026), (0x046D, 0x0825)), "no depth camera is seen"),  # Bluetooth, a webcam
         (((0x8086, 0x0B07),), "seen: RealSense (device=realsense)"),
+        (((0x8086, 0x0B64),), "seen: RealSense L515 or SR300 (no longer in its SDK)"),
         (((0x2BC5, 0x66B), (0x45E, 0x97C)), "seen: Orbbec (device=orbbec), Azure Kinect"),
+        (((0x2BC5, 0x403),), "seen: Orbbec Astra, Astra+ or first Femto (not in its SDK 2)"),
     ],
 )
 def test_a_missing_camera_is_answered_with_those_on_usb(monkeypatch, ids, words: str) -> None:

@@ -10,10 +10,13 @@ from typing import Any
 
 import usb.core
 
+_OLD_ORBBEC = "(040[1-4]|060f|063[2-8]|0668)"
 _KNOWN = {
-    "RealSense (device=realsense)": "8086:(0a(66|80|a5|d[1-6]|f6|f[ef])|0b(0[0137]|3[ad]|4[89bd])"
-    "|0b(52|5[bc]|6[48])|abcd)",
-    "Orbbec (device=orbbec)": "2bc5:",
+    "RealSense (device=realsense)": "8086:(0a(d[1-6]|f6|f[ef])|0b(0[0137]|3a|4[9bd]|5[26bc])"
+    "|1155|abcd)",
+    "RealSense L515 or SR300 (no longer in its SDK)": "8086:(0a(66|80|a5)|0b(3d|48|6[48]))",
+    "Orbbec (device=orbbec)": f"2bc5:(?!{_OLD_ORBBEC})",
+    "Orbbec Astra, Astra+ or first Femto (not in its SDK 2)": f"2bc5:{_OLD_ORBBEC}",
     "SwissRanger (device=sr3000)": "0852:0074|1ad2:007[45]",
     **{"Azure Kinect": "045e:097c", "Kinect V2": "045e:02(c4|d8)", "Kinect": "045e:02ae"},
     **{"Luxonis": "03e7:(2485|f63b)", "Stereolabs": "2b03:", "pmd": "1c28:", "PrimeSense": "1d27:"},
