@@ -25,6 +25,7 @@ from toftrack.recordings.store import open_recording
 
 K = np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]])
 ABOUT = calibration(K, 512, (96, 90))
+FEMTO = "CALIBRATION_LensDistortionModelRational6KT"
 REPORTED = Given((30.0, 31.0, 15.5, 11.5))
 
 
@@ -73,6 +74,15 @@ def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
     assert (camera.width, camera.height) == size
 
 
+def test_a_femtos_calibration_names_the_lens_otherwise(tmp_path: Path) -> None:
+    about = broken(lambda c: c["Intrinsics"].update(ModelType=FEMTO))
+    camera = open_recording(
+        write_kinect(tmp_path / "a.mkv", np.ones((1, 288, 320), np.uint16), about=about)
+    ).camera
+    np.testing.assert_allclose(camera.K, K, atol=1e-9)
+    np.testing.assert_allclose(camera.distortion, RATIONAL)
+
+
 @pytest.mark.parametrize("share", [0.5, 0.95])
 def test_a_kinects_recording_that_was_cut_off_is_used_so_far(
     tmp_path: Path, images: tuple[np.ndarray, np.ndarray], share: float
@@ -100,6 +110,7 @@ def broken(change: Callable[[dict], Any]) -> dict:
         (b"{", "calibration.json.*damaged"),
         (broken(lambda c: c["Intrinsics"]["ModelParameters"].pop()), "13 parameters"),
         (broken(lambda c: c.update(SensorWidth=640)), "another kind.*640"),
+        (broken(lambda c: c["Intrinsics"].update(ModelType="Theta")), "another kind.*Theta"),
     ],
 )
 def test_a_calibration_that_tells_no_lens_is_reported(

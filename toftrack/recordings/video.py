@@ -217,7 +217,9 @@ _MODES = {
 }
 """By the image's size (narrow binned, narrow, wide binned, wide): the sensor's width after
 binning, and where the image begins on it."""
-_MODEL = "CALIBRATION_LensDistortionModelBrownConrady"
+_MODELS = ("BrownConrady", "Rational6KT")
+"""Both are OpenCV's rational one; the second, which Orbbec's Femto names, counts a part of p1 and
+p2 half, a hundredth of a pixel."""
 _CALIBRATION = "calibration.json"
 _ADVICE = "give a calibrated camera with camera.file=FILE"
 
@@ -264,7 +266,8 @@ def _camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
         model = lens["ModelType"]
     except (ValueError, KeyError, TypeError, StopIteration):
         raise ToftrackError(f"the {_CALIBRATION} in '{path}' is damaged; {_ADVICE}") from None
-    if model != _MODEL or size != (_SENSOR_PX, _SENSOR_PX) or numbers.shape != (14,):
+    named = str(model).removeprefix("CALIBRATION_LensDistortionModel") in _MODELS
+    if not named or size != (_SENSOR_PX, _SENSOR_PX) or numbers.shape != (14,):
         raise ToftrackError(
             f"the {_CALIBRATION} in '{path}' is of another kind ({model}, sensor of {size}, "
             f"{numbers.size} parameters); {_ADVICE}"
