@@ -118,10 +118,12 @@ def tiff(number: int) -> bytes:
     return cv2.imencode(".tif", DEPTH[number])[1].tobytes()
 
 
-def exr(number: int, names: str = "Z") -> bytes:
+def exr(number: int, names: str = "Z", seen: Any = True) -> bytes:
+    """As Blender has it, there is 1e10 where nothing is seen."""
     library = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed")
     target = io.BytesIO()
-    channels = {name: DEPTH[number] for name in names.split()}
+    depth = np.where(seen, DEPTH[number], np.float32(1e10))
+    channels = {name: depth for name in names.split()}
     library.File({"compression": library.ZIP_COMPRESSION}, channels).write(target)
     return target.getvalue()
 
@@ -169,6 +171,12 @@ def test_the_depth_among_the_images_is_read_and_the_rest_told(
     with caplog.at_level(logging.WARNING), Replay(path, intrinsics=GIVEN.intrinsics) as device:
         assert len(list(device)) == 3
     assert ("are left out" in caplog.text) == (store.left_out is not None)
+
+
+def test_where_a_rendered_image_shows_nothing_there_is_no_reading(tmp_path: Path) -> None:
+    seen = DEPTH[0] < 0.8  # less than half of it
+    store = ImageFolder(laid_out(tmp_path, {"1.exr": exr(0, "Depth.V", seen)}, False), GIVEN)
+    np.testing.assert_array_equal(store.image(0)[0], np.where(seen, DEPTH[0], 0))
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,8 @@ _TAGS = {256: 0, 257: 0, 258: 1, 277: 1, 339: 1, 322: 0, 323: 0}
 """Width, height, bits, channels, kind of number, a tile's width and height; and what holds where
 they are not stated."""
 _EXR = b"\x76\x2f\x31\x01"
+_NOTHING_M = 1e10
+"""What Blender says where nothing is seen."""
 
 
 def pages_of(stream: IO[bytes]) -> list[Page]:
@@ -185,7 +187,8 @@ def _decoded_exr(content: bytes) -> np.ndarray:
         raise ValueError("it is damaged")
     if not all(np.array_equal(one, read[0], equal_nan=True) for one in read):
         raise ValueError("it is a colour image")
-    return read[0].astype(np.float32)
+    depth = read[0].astype(np.float32)
+    return np.where(depth < _NOTHING_M, depth, np.float32(0))
 
 
 def _depth_channels(names: list[str]) -> list[str]:
