@@ -225,6 +225,13 @@ def test_quantised_inverse_depth_is_exact_to_its_steps(packed: str) -> None:
     assert (found[:3] == 0).all()
 
 
+def test_the_oldest_compressed_depth_names_no_transport() -> None:
+    depth = some_depth(1)[0]
+    message = as_message(compressed(depth, "16UC1"))
+    found = ros_messages.depth_image(message, COMPRESSED, 0.001)
+    np.testing.assert_allclose(found, depth, atol=1e-6)
+
+
 def test_an_image_with_too_few_bytes_is_reported() -> None:
     fields = image(some_depth(1)[0])
     for change in ({"data": fields["data"][:-70]}, {"step": 3}, {"height": 0}, {"width": 2**31}):

@@ -34,8 +34,7 @@ def encoding(message: Any, kind: str) -> str:
 
 def is_depth(words: str) -> bool:
     """An `encoding` is one of depth images."""
-    transport = words.partition(";")[2]
-    return words.startswith(("16UC1", "32FC1")) and (not transport or _lossless(words))
+    return words.startswith(("16UC1", "32FC1")) and _lossless(words)
 
 
 def depth_image(message: Any, kind: str, unit_m: float) -> np.ndarray:
@@ -143,7 +142,8 @@ def decoded_rvl(content: bytes) -> np.ndarray:
 
 def _lossless(words: str) -> bool:
     transport = words.partition(";")[2]
-    return "compressedDepth" in transport or "png" in transport
+    # The oldest compressedDepth does not name itself: it was PNG only.
+    return not transport or "compressedDepth" in transport or "png" in transport
 
 
 def _colour(words: str) -> str:
