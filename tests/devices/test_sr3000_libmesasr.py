@@ -152,7 +152,10 @@ def test_a_library_that_lacks_a_function_is_reported(libraries: Libraries) -> No
 
 @pytest.mark.parametrize(
     ("serial", "words"),
-    [(None, "libnowhere.so.*vendor's package.*transport=usb"), ("SN-12", "SN-12 is not a number")],
+    [
+        (None, "libnowhere.so.*vendor's package.*transport=usb"),
+        ("SN-12", "SN-12 is not a number.*as 0x"),
+    ],
 )
 def test_no_library_and_no_number_are_reported(serial: str | None, words: str) -> None:
     with pytest.raises(ToftrackError, match=words):

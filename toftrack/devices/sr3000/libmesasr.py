@@ -31,7 +31,8 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
 class MesaTransport:
     """One camera, opened and read by the vendor's library; exposure: set when it is opened.
 
-    serial: a number in decimal or 0x..; None = the first camera. ToftrackError where it is none.
+    serial: the last 8 digits of the printed number, which are hexadecimal, as 0x...; None = the
+    first camera. ToftrackError where it is no number.
     """
 
     def __init__(
@@ -142,7 +143,7 @@ def _number(serial: str | None) -> int:
         number = -1
     if not 0 <= number <= 0xFFFFFFFF:
         raise ToftrackError(
-            f"device.serial={serial} is not a number, which the vendor's library needs; give it in "
-            "decimal or as 0x..."
+            f"device.serial={serial} is not a number, which the vendor's library needs; give the "
+            "last 8 digits of the printed one as 0x4000002f"
         )
     return number
