@@ -11,6 +11,8 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from helpers.bags import recording as ros_recording
+from helpers.bags import write_bag
 from helpers.settings import realsense, realsense_emulator
 
 from toftrack.devices.realsense.device import (
@@ -23,6 +25,7 @@ from toftrack.devices.realsense.device import (
 from toftrack.devices.realsense.emulator import EmulatedCamera
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 FINE = realsense_emulator(fps=500.0, unit_m=0.0001)
 
@@ -126,6 +129,17 @@ def test_what_is_no_recording_is_reported(rs: ModuleType, tmp_path: Path, record
             path.write_bytes(content)
             with pytest.raises(ToftrackError, match="a.*' is not a recording of a RealSense"):
                 realsense(bag=path)
+
+
+@pytest.mark.parametrize("kind", ["bag", "db3"])
+def test_a_bag_of_ros_topics_is_told_how_it_is_tracked(
+    rs: ModuleType, tmp_path: Path, kind: str
+) -> None:
+    camera = Camera(np.array([[40.0, 0, 15.5], [0, 41.0, 11.5], [0, 0, 1]]), 32, 24)
+    path = write_bag(tmp_path, kind, ros_recording(np.ones((3, 24, 32)), camera))
+    bag = path if path.is_file() else next(path.glob("*.db3"))
+    with pytest.raises(ToftrackError, match="bag of ROS topics.*toftrack track FILE"):
+        realsense(bag=bag)
 
 
 MODELS = ("brown_conrady", "modified_brown_conrady", "inverse_brown_conrady")

@@ -21,7 +21,7 @@ BUSY = (
     "close other programs that use it, plug it in again, into a USB 3 port, and on Linux install "
     "its udev rules"
 )
-OTHER_FILE = "choose another file"
+OTHER_FILE = "choose another file (a bag of ROS topics needs no device: toftrack track FILE)"
 
 _LONGEST_GAP_S = 60  # results have a row for each index, so that a wild number must not become one
 

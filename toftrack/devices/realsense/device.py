@@ -87,6 +87,8 @@ class RealSense(SdkCamera):
         with reported_errors(f"{self._owner} cannot be used", self._remedy, RuntimeError):
             chosen = choose_streams(rs, self._device, size, infrared, self._owner)
             sensor, self._depth, self._infrared = chosen
+            if not self._depth.fps():  # which the SDK says of a bag of ROS 2
+                raise ToftrackError(f"{self._owner} is a bag of ROS topics; {OTHER_FILE}")
             if preset is not None:
                 set_preset(rs, sensor, preset)
             own = self._depth.as_video_stream_profile().get_intrinsics()
