@@ -303,6 +303,7 @@ PAPER = ("experiment=paper", "gestures=none", "hand.side=right")
     ("score", "said"),
     [
         ("counts.correct / union", r"gives \[nan, nan\] where correct is \[0.0, 0.0\]"),
+        ("(counts.correct / union.clamp(min=1)).numpy()", "gives ndarray; it must give a tensor"),
         ("counts.correct / union.clamp(min=1) - 1", r"gives \[-1.0, -1.0\]"),
         ("counts.correct.mean()", "gives 0.0 where"),
         ("1 / union.clamp(min=1)", r"gives \[1.0, 1.0\]"),

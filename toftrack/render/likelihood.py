@@ -163,7 +163,12 @@ def _f_measures(correct, false, missed, residual, numbers, logarithm, found):
 
 def checked_score(likelihood: Likelihood, counts: Counts) -> Tensor:
     """(N,) its scores; ToftrackError where they are none as `Likelihood.score` has them."""
-    found, correct = torch.as_tensor(likelihood.score(counts)), counts.correct
+    found, correct = likelihood.score(counts), counts.correct
+    if not isinstance(found, Tensor):
+        raise ToftrackError(
+            f"likelihood: {type(likelihood).__name__}.score gives {type(found).__name__}; it must "
+            "give a tensor, (N,) numbers of 0 to 1"
+        )
     pairs = zip(found.reshape(-1).tolist(), correct.tolist(), strict=False)
     if found.shape == correct.shape and all(0 <= one <= 1.0001 * (n > 0) for one, n in pairs):
         return found
