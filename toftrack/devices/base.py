@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Self
 
+import numpy as np
+
 from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame, Truth
@@ -31,7 +33,7 @@ class BaseDevice:
         self.camera, self.fps = camera, float(fps)
         """Of the images; what the overlay video plays at."""
         self.frames, self.truth = frames, truth
-        """How many frames an iteration yields at most (None for a live camera); a row for each."""
+        """How many frames an iteration yields at most (None: unknown); a row for each."""
         self.live, self.dropped = live, 0
         """Frames do not wait: the newest is delivered, and what comes too late is dropped; frames
         of the latest iteration that nobody was there to take, 0 unless `live`."""
@@ -61,13 +63,16 @@ class BaseDevice:
 def frames_of(device: BaseDevice) -> Iterator[Frame]:
     """Its frames; ToftrackError for anything else, which one of somebody's own may yield."""
     for frame in device:
-        if not isinstance(frame, Frame):
+        wrong = "" if isinstance(frame, Frame) else type(frame).__name__
+        if not wrong and not isinstance(frame.depth, np.ndarray):
+            wrong = f"one with a depth of {type(frame.depth).__name__}"
+        if wrong:
             code: Any = getattr(type(device).__iter__, "__code__", None)
             place = code and f"{code.co_qualname} ({code.co_filename}, line {code.co_firstlineno})"
             raise ToftrackError(
                 "a device must yield Frame(index, timestamp_s, depth, amplitude, radial), and "
                 "nothing when there is no image, but "
-                f"it yielded {type(frame).__name__}, in {place or type(device).__name__}"
+                f"it yielded {wrong}, in {place or type(device).__name__}"
             )
         yield frame
 

@@ -339,7 +339,8 @@ def _opening(metadata: dict[str, Any], device: Device) -> str:
     """What is tracked, how many hands, which side, which size: one line to begin with."""
     about, shape, config = metadata["device"], metadata["hand_shape"], metadata["config"]
     source = about.get("recording") or about.get("device")
-    count = "live" if device.frames is None else f"{device.frames} frames"
+    count = "live" if device.live else "until it ends"
+    count = count if device.frames is None else f"{device.frames} frames"
     if (hands := config.get("hands", 1)) > 1:
         what = f"up to {hands} hands, their lengths"
     elif (side := shape["side"]) == "auto":
