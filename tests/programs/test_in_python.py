@@ -204,7 +204,14 @@ def test_estimates_are_sent_and_smoothed_where_overrides_say_so() -> None:
     assert not np.array_equal(tracking.results().joints_m[2], smooth[2])
 
 
-@pytest.mark.parametrize(("depth", "time_s"), [(np.ones((2, 2)), 0.0), (sample().depth_m[0], "a")])
+@pytest.mark.parametrize(
+    ("depth", "time_s"),
+    [
+        (np.ones((2, 2)), 0.0),
+        (sample().depth_m[0], "a"),
+        ((1000 * sample().depth_m[0]).astype(np.uint16), 0.0),
+    ],
+)
 def test_what_is_no_frame_is_refused_where_it_is_pushed(depth: Any, time_s: Any) -> None:
     camera = toftrack.PushDevice(Sample().camera)
     with pytest.raises(toftrack.ToftrackError):

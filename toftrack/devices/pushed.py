@@ -12,7 +12,7 @@ import numpy as np
 from toftrack.devices.base import BaseDevice
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.frames.frame import Frame, checked_moment
+from toftrack.frames.frame import Frame, checked_moment, wrong_unit
 
 _LOOK_S = 0.1
 
@@ -35,7 +35,9 @@ class PushDevice(BaseDevice):
         now = time.monotonic() if timestamp_s is None else timestamp_s
         count, time_s = checked_moment(self._count, now)
         image = np.array(depth, copy=True)
-        if image.shape != (self.camera.height, self.camera.width) or image.dtype.kind not in "fiu":
+        if image.dtype.kind in "iu":
+            raise wrong_unit("the depth image", image, str(image.dtype))
+        if image.shape != (self.camera.height, self.camera.width) or image.dtype.kind != "f":
             raise ToftrackError(
                 f"an image of {image.dtype}, shape {image.shape}, was pushed; give numbers, "
                 f"{self.camera.height} rows and {self.camera.width} columns as the camera has"
