@@ -387,9 +387,16 @@ class RealTime:
             return ""
         took_ms = 1e3 * self.busy_s / max(1, self.tracked)
         quality = f", {self.reduced} of them with reduced effort" if self.reduced else ""
+        dropped = f"{self.dropped} of {came} frames were dropped"
+        took = f"tracking, drawing and sending a frame took {took_ms:.0f} ms"
+        if took_ms * self.fps < 1e3:
+            return (
+                f"{dropped}, although {took} on average, which suffices for {self.fps:g} frames/s"
+                f" ({self.tracked} were tracked{quality}): there were pauses of up to"
+                f" {self.longest_gap_s:.1f} s, as at the start or beside other programs."
+            )
         return (
-            f"{self.dropped} of {came} frames were dropped: the machine was too slow for "
-            f"{self.fps:g} frames/s, as tracking, drawing and sending a frame took {took_ms:.0f} ms"
+            f"{dropped}: the machine was too slow for {self.fps:g} frames/s, as {took}"
             f" ({self.tracked} were tracked{quality}). Run nothing else meanwhile, draw less"
             " (view=none), or ask the camera for fewer frames or smaller images."
         )
