@@ -348,5 +348,5 @@ class Camera:
         if image.shape != (self.height, self.width):
             raise ToftrackError(
                 f"the image has the shape {image.shape}, but the camera has {self.height} rows and "
-                f"{self.width} columns; use the camera file that belongs to the recording"
+                f"{self.width} columns; give the camera that took the images"
             )
