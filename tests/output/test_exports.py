@@ -89,3 +89,11 @@ def test_a_lost_hand_is_hidden_and_its_pose_held() -> None:
     for frame, held in ((0, 1), (3, 2), (4, 2)):
         for name, place in gltf.world(frame).items():
             assert np.allclose(place, gltf.world(held)[name]), (frame, name)
+
+
+def test_keys_that_32_bits_cannot_tell_apart_follow_one_another() -> None:
+    steps_s = [0, 0.04, 2400, 0.00005, 0.00005, 0.04, 0.04, 0.04]  # a burst after 40 minutes
+    times_s = np.cumsum(steps_s)
+    late = [replace(hand, timestamp_s=t) for hand, t in zip(moving(), times_s, strict=True)]
+    time_s, _, _ = exported(late, "right").channels()["Hand_R", "scale"]
+    assert (np.diff(time_s) > 0).all() and np.allclose(time_s, times_s, rtol=0, atol=0.001)

@@ -221,7 +221,10 @@ def _skin(file: _File, motion: HandMotion, first: int) -> int:
 
 def _animate(file: _File, motion: HandMotion, first: int) -> None:
     gltf, animation = file.gltf, file.animation
-    time = file.array(motion.time_s, gltf.SCALAR, limits=True)
+    keys_s = motion.time_s.astype(np.float32)
+    for row in range(1, len(keys_s)):  # each later than the one before, even where 32 bits are few
+        keys_s[row] = max(keys_s[row], np.nextafter(keys_s[row - 1], np.float32(np.inf)))
+    time = file.array(keys_s, gltf.SCALAR, limits=True)
 
     def add(node: int, path: str, values: np.ndarray, kind: str, steps: str) -> None:
         sampler = gltf.AnimationSampler(
