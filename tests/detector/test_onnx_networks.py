@@ -1,7 +1,10 @@
 """ONNX Runtime says what torch says; its files are those of the weights, or are not used."""
 
 import logging
+import os
 import shutil
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -11,7 +14,7 @@ import pytest
 import torch
 from helpers.detection import small_networks
 from helpers.settings import detector_settings
-from helpers.tracking import sample
+from helpers.tracking import ROOT, sample
 
 from toftrack.detector import onnx_networks
 from toftrack.detector.crops import CROP, CROP_CHANNELS, wide
@@ -188,6 +191,14 @@ def test_several_threads_and_batches_get_the_same_answers() -> None:
     for found in reported:
         for one, two in zip(found, alone, strict=True):
             assert torch.equal(one.keypoints.points_m, two.keypoints.points_m)
+
+
+def test_onnx_runtime_sends_nothing_and_keeps_no_number_of_the_machine(tmp_path: Path) -> None:
+    code = "from toftrack.detector.onnx_networks import load_networks; load_networks()"
+    places = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    env = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=env | places, check=True)
+    assert not [path for path in tmp_path.rglob("*") if "onnxruntime" in path.name]
 
 
 def test_on_another_device_torch_runs_them() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -35,6 +36,9 @@ _LARGEST_BYTES = 1 << 28
 _MADE_OF = ("format", "version", "network", "weights_sha256")
 """Properties of such a file that say which network it is, and of which weights."""
 _log = logging.getLogger(__name__)
+
+# Before ONNX Runtime is loaded, here or by an export: later versions report at once that they are.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 
 @dataclass(frozen=True, eq=False)
