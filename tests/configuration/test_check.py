@@ -242,7 +242,7 @@ def test_interpolations_that_grow_by_one_another_are_refused_at_once(
     rising = [f"+v{i}='{doubled.replace('{0}', str(i - 1))}'" for i in range(1, 29)]
     overrides = [f"+v0={first}", *(one.replace("'", "") if "[" in one else one for one in rising)]
     folder = tmp_path / "runs"
-    assert main(["track", *overrides, f"hydra.run.dir={folder}/${{v28}}"]) == 1
+    assert main(["track", *overrides, f"hydra.run.dir='{folder}/${{v28}}'"]) == 1
     said = capsys.readouterr().err
     assert "make the configuration too large" in said and said.count("\n") == 1
     assert not folder.exists()

@@ -60,14 +60,14 @@ def given_for(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, str],
     Camera(np.array([[50, 0, 20], [0, 50, 15], [0, 0, 1]]), 40, 30).save(images / "camera.json")
     sample = ROOT / "toftrack" / "data" / "sample.npz"
     return {
-        ("device", "replay"): [f"device.path={sample}"],
-        ("device", "folder"): [f"device.path={images}"],
+        ("device", "replay"): [f"device.path='{sample}'"],
+        ("device", "folder"): [f"device.path='{images}'"],
         ("device", "sr3000"): ["device.transport=emulated"],  # there is no camera here
         ("device", "realsense"): ["device.transport=emulated"],
-        ("data", "file"): [f"data.path={folder / 'poses.csv'}"],
-        ("data", "leap"): [f"data.path={folder / 'leap.npz'}"],
-        ("data", "run"): [f"data.path={folder}"],
-        ("data", "mixture"): [f"data.parts.leap.path={folder / 'leap.npz'}"],
+        ("data", "file"): [f"data.path='{folder}/poses.csv'"],
+        ("data", "leap"): [f"data.path='{folder}/leap.npz'"],
+        ("data", "run"): [f"data.path='{folder}'"],
+        ("data", "mixture"): [f"data.parts.leap.path='{folder}/leap.npz'"],
     }
 
 
@@ -86,7 +86,7 @@ def test_every_option_composes_and_can_be_made(
     if option == "rosbag":
         frames = [np.ones((6, 8), np.float32)]
         bag = write_bag(tmp_path, "bag", recording(frames, Camera(np.diag((9.0, 9, 1)), 8, 6)))
-        given = [f"device.path={bag}"]
+        given = [f"device.path='{bag}'"]
     paper = ["experiment=paper"] if group == "start" else []
     name = "train_pose_space" if group == "data" else "config"
     config = configuration(*paper, f"{group}={option}", *given, name=name)
@@ -113,10 +113,10 @@ def test_the_defaults_are_options_that_there_are() -> None:
 def test_a_calibrated_camera_reaches_every_device_that_replays(tmp_path: Path) -> None:
     gone = tmp_path / "gone.json"
     for overrides in (["device=sample"], ["device=replay", "device.path=sample.npz"]):
-        config = configuration(*overrides, f"camera.file={gone}")
+        config = configuration(*overrides, f"camera.file='{gone}'")
         assert config.device.camera_file == str(gone)
     with pytest.raises(hydra.errors.InstantiationException) as caught:
-        hydra.utils.instantiate(configuration(f"camera.file={gone}").device)
+        hydra.utils.instantiate(configuration(f"camera.file='{gone}'").device)
     assert isinstance(caught.value.__cause__, ToftrackError)
 
 
@@ -137,7 +137,7 @@ def test_the_paper_s_pose_space_takes_a_file_and_dimensions_of_a_choice(tmp_path
     (tmp_path / "pose_space").mkdir()
     text = "defaults: [pca]\ndims: 6\nfile: mine.npz\n"
     (tmp_path / "pose_space" / "mine.yaml").write_text(text)
-    given = [f"hydra.searchpath=[{tmp_path}]", "experiment=paper", "pose_space=mine"]
+    given = [f"hydra.searchpath=['{tmp_path}']", "experiment=paper", "pose_space=mine"]
     assert configuration(*given).pose_space.dims == 6
 
 

@@ -146,7 +146,7 @@ def test_an_installed_package_brings_every_kind(package: Path) -> None:
     head = ["tolerance_m=0.02", "neighbourhood_m=0.02", "false_weight=1"]
     given = [f"likelihood.{word}" for word in head] + ["pose_space.iterations=400"]
     chosen = [f"{group}=theirs" for group in GROUPS]
-    camera = ("device=theirs", f"device.path={package / 'images.npy'}", "device.focal_px=200")
+    camera = ("device=theirs", f"device.path='{package}/images.npy'", "device.focal_px=200")
     config = configuration(*chosen, *given, *camera, "stream.path=tips.txt", "view.every=5")
     assert config.stream["_target_"] == "my_stream.TipLog"
     assert not MODULES & set(sys.modules), "what is not used is not imported"
@@ -397,7 +397,7 @@ def test_a_number_in_place_of_a_choice_is_one_sentence(tmp_path: Path) -> None:
 
 def test_toftrack_track_takes_a_folder_of_ones_own(mine: Path) -> None:
     folder, few = mine / "my_conf", ("device.stop=1", "filter.particles=20")
-    words = ("device=mine", f"device.path={mine / 'images.npy'}", few[1])
+    words = ("device=mine", f"device.path='{mine}/images.npy'", few[1])
     assert len(list(toftrack.track(*words, config_dir=folder))) == FRAMES
     found = toftrack.track(mine / "images.raw16", "device=raw16", *few, config_dir=folder)
     assert len(list(found)) == 1

@@ -109,7 +109,7 @@ def _composed(name: str, *overrides: str) -> DictConfig:
 
 def run(folder: Path, device: Device, *overrides: str) -> None:
     """What `python track.py` does with overrides and an opened device, in this process."""
-    hydra = (f"hydra.runtime.output_dir={folder}", "hydra.job.num=0", "hydra.job.id=0")
+    hydra = (f"hydra.runtime.output_dir='{folder}'", "hydra.job.num=0", "hydra.job.id=0")
     with modest_files(), initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[*overrides, *hydra], return_hydra_config=True)
     HydraConfig.instance().set_config(config)

@@ -332,7 +332,7 @@ def test_a_sweep_prefers_no_space_that_held_out_clips_could_not_judge(tmp_path: 
     poses = np.degrees(random_angles(8).numpy())
     rows = [",".join((str(n // 2), *(f"{a:.4f}" for a in pose))) for n, pose in enumerate(poses)]
     (tmp_path / "poses.csv").write_text("\n".join(("# units: degrees", clips, *rows)) + "\n")
-    given = ["-m", "data=file", f"data.path={tmp_path / 'poses.csv'}", "pose_space.dims=3,7"]
+    given = ["-m", "data=file", f"data.path='{tmp_path}/poses.csv'", "pose_space.dims=3,7"]
     given += ["compare=[]", "hydra.sweep.dir=sweep"]
     status, out, err = programs.call(*given, folder=tmp_path, program="train_pose_space.py")
     assert status == 0, err

@@ -255,19 +255,20 @@ def test_help_of_a_module_that_is_run_is_no_error(words: str) -> None:
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_log_on_a_full_disk_ends_no_run(tmp_path: Path) -> None:
-    words = "track", "view=none", "device.stop=2", "experiment=paper", f"hydra.run.dir={tmp_path}"
+    words = "track view=none device.stop=2 experiment=paper hydra.run.dir=.".split()
     with open("/dev/full", "wb") as full:
-        done = subprocess.run([sys.executable, "-m", "toftrack", *words], stderr=full, check=False)
+        done = subprocess.run([sys.executable, "-m", "toftrack", *words], cwd=tmp_path, stderr=full)
     assert done.returncode == 0
     assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
 
 
 @pytest.mark.parametrize("unbuffered", ["", "1"])
 def test_a_run_whose_log_nobody_reads_on_keeps_its_results(unbuffered: str, tmp_path: Path) -> None:
-    words = f"track view=none device.stop=2 experiment=paper hydra.run.dir={tmp_path}"
+    words = "track view=none device.stop=2 experiment=paper hydra.run.dir=."
     subprocess.run(
         f"{sys.executable} -m toftrack {words} 2>&1 | head -n 1",
         env=os.environ | {"PYTHONUNBUFFERED": unbuffered},
+        cwd=tmp_path,
         shell=True,
         check=True,
     )
@@ -280,8 +281,8 @@ def test_a_program_runs_with_closed_streams_but_streams_to_none(
 ) -> None:
     stream = "stream=stdout" if status else "stream=none"
     words = f"{sys.executable} -m toftrack track {stream} view=none device.stop=2 experiment=paper"
-    command = ["sh", "-c", f"{words} hydra.run.dir={tmp_path}/run {closed}"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    command = ["sh", "-c", f"{words} hydra.run.dir=run {closed}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == status, done.stderr
     assert (len(done.stderr.splitlines()) > 0) == (closed != "2>&-")
     if status:

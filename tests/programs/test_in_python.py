@@ -120,7 +120,7 @@ def test_the_device_is_closed_however_the_loop_ends() -> None:
 
 
 def test_a_program_that_ends_within_the_loop_ends_and_keeps_its_recording(tmp_path: Path) -> None:
-    words = *PAPER, f"record={tmp_path / 'kept.npz'}", "stream=websocket", "stream.port=0"
+    words = *PAPER, f'record="{tmp_path}/kept.npz"', "stream=websocket", "stream.port=0"
     program = f"import toftrack\nframes = iter(toftrack.track('device=sample', *{words}))"
     with subprocess.Popen([sys.executable, "-c", f"{program}\nnext(frames)"]) as process:
         try:

@@ -92,7 +92,7 @@ def test_a_run_keeps_what_it_saw_and_tracking_that_gives_the_same(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     camera, path = an_sr3000(monkeypatch), tmp_path / "kept.npz"
-    run(tmp_path / "live", camera, *TRACK, f"record={path}")
+    run(tmp_path / "live", camera, *TRACK, f"record='{path}'")
     run(tmp_path / "again", Replay(path), *TRACK)
     live, again = (np.load(tmp_path / name / "track.npz") for name in ("live", "again"))
     assert live["joints_m"].shape == (FEW, 21, 3)
@@ -105,7 +105,7 @@ def test_what_came_before_an_error_is_kept_with_gaps_where_frames_were_dropped(
 ) -> None:
     camera = Camera(FEW, every=2, fails=ToftrackError)
     with pytest.raises(ToftrackError, match="unplugged"):
-        run(tmp_path / "run", camera, *TRACK, f"record={tmp_path / 'a.npz'}")
+        run(tmp_path / "run", camera, *TRACK, f"record='{tmp_path}/a.npz'")
     with pytest.raises(ToftrackError, match="unplugged"):
         record_frames(camera, Recorder(tmp_path / "b.npz", camera, 1.0))
     assert f"{tmp_path / 'b.npz'}: {FEW} frames" in capsys.readouterr().out
@@ -121,7 +121,7 @@ def test_a_recording_that_fails_does_not_end_the_run(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("toftrack.recordings.unfinished.UnfinishedRecording.append", full)
-    run(tmp_path / "run", Sample(stop=FEW), *TRACK, f"record={tmp_path / 'kept.npz'}")
+    run(tmp_path / "run", Sample(stop=FEW), *TRACK, f"record='{tmp_path}/kept.npz'")
     with np.load(tmp_path / "run" / "track.npz") as track:
         assert len(track["lost"]) == FEW
     assert [line for line in caplog.messages if "recording" in line] == [
@@ -132,7 +132,7 @@ def test_a_recording_that_fails_does_not_end_the_run(
 def test_a_run_whose_recording_exists_does_not_begin(tmp_path: Path) -> None:
     (tmp_path / "kept.npz").write_text("mine")
     with pytest.raises(ToftrackError, match="exists already"):
-        run(tmp_path / "run", Sample(stop=FEW), *TRACK, f"record={tmp_path / 'kept.npz'}")
+        run(tmp_path / "run", Sample(stop=FEW), *TRACK, f"record='{tmp_path}/kept.npz'")
     assert (tmp_path / "kept.npz").read_text() == "mine"
     assert not (tmp_path / "run").exists()
 

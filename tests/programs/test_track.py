@@ -121,7 +121,8 @@ def test_a_run_of_a_wall_ends_with_what_to_try(here, tmp_path: Path) -> None:
 
 
 def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
-    command = [sys.executable, str(ROOT / "track.py"), "hydra.run.dir=out", *QUICK]
+    endless = (str(ROOT / "track.py"), "device.repeat=true", "hydra.run.dir=out")
+    command = [sys.executable, *endless, *QUICK]
     env = os.environ | {"HYDRA_FULL_ERROR": "0", "OMP_NUM_THREADS": "1"}
     said = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = subprocess.Popen(command, cwd=tmp_path, env=env, text=True, **said)
@@ -137,7 +138,7 @@ def test_a_run_that_is_terminated_keeps_what_was_done(tmp_path: Path) -> None:
     assert "interrupted" in err and "Traceback" not in err
     assert "time a frame" in out and "overlay.mp4" in out
     done = [json.loads(line) for line in lines.read_text().splitlines()]
-    assert 3 <= len(done) < 100
+    assert len(done) >= 3
     result = read_results(tmp_path / "out" / "track.npz")
     assert len(result["joints_m"]) == len(done)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())

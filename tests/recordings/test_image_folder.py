@@ -57,7 +57,7 @@ def test_the_camera_file_that_the_page_shows_is_read(folder: Path) -> None:
 def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    words = ["view=none", "hand.side=right", f"hydra.run.dir={tmp_path / 'run'}", *QUICK]
+    words = ["view=none", "hand.side=right", f"hydra.run.dir='{tmp_path}/run'", *QUICK]
     assert main(["track", str(folder), *words]) == 1
     assert "device.intrinsics=[FX,FY,CX,CY]" in capsys.readouterr().err
     assert main(["track", str(folder), LENS, "device.fps=50", *words]) == 0
@@ -72,13 +72,13 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
 @pytest.mark.parametrize("given", ["[200,200,88]", "[-1,200,88,72]", "200", "[1,1,88,72]"])
 def test_lenses_that_are_none_are_reported(given: str, folder: Path) -> None:
     with pytest.raises(ToftrackError, match="intrinsics|of 176x144 pixels") as caught:
-        make_device("device=folder", f"device.path={folder}", f"device.intrinsics={given}")
+        make_device("device=folder", f"device.path='{folder}'", f"device.intrinsics={given}")
     assert "\n" not in str(caught.value)
 
 
 def test_a_lens_is_reported_once(folder: Path) -> None:
     ImageFolder(folder, Given([201, 202, 87, 71])).camera.save(folder / "mine.json")
-    words = ["device=folder", f"device.path={folder}", f"camera.file={folder / 'mine.json'}"]
+    words = ["device=folder", f"device.path='{folder}'", f"camera.file='{folder}/mine.json'"]
     with make_device(*words) as device:
         np.testing.assert_array_equal(device.camera.K, K)
     with pytest.raises(ToftrackError, match="both give the lens; leave one out"):
@@ -270,6 +270,6 @@ def test_an_archive_is_converted_with_its_camera_and_times(tmp_path: Path) -> No
     files |= {"take/camera.json": (tmp_path / "c.json").read_bytes()}
     files |= {"take/depth/timestamps.txt": b"1 1.5 2"}
     convert.main([str(laid_out(tmp_path, files, True)), str(tmp_path / "out.npz")])
-    with make_device("device=replay", f"device.path={tmp_path / 'out.npz'}") as device:
+    with make_device("device=replay", f"device.path='{tmp_path}/out.npz'") as device:
         assert [frame.timestamp_s for frame in device] == [1, 1.5, 2]
         assert device.camera.K[0, 0] == 40

@@ -174,7 +174,7 @@ def test_dataset_unit_and_rate_are_given_on_the_command_line(tmp_path: Path) -> 
     path = hdf5(tmp_path / "a.h5", depth=WORDS, ir=WORDS // 2)
     with pytest.raises(ToftrackError, match="no array of images 'color'.*depth"):
         opened(path, "color")
-    words = [f"device.path={path}", "device.dataset=/depth", "device.unit_m=0.0005"]
+    words = [f"device.path='{path}'", "device.dataset=/depth", "device.unit_m=0.0005"]
     lens = "device.intrinsics=[40,40,15.5,11.5]"
     with make_device("device=replay", *words, lens, "device.fps=50") as device:
         first = next(iter(device))

@@ -142,7 +142,7 @@ def test_the_rate_rises_stays_and_falls_to_nothing() -> None:
 def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
     line = [sys.executable, "-m", "toftrack.training", "train"]
     return subprocess.run(
-        [*line, f"hydra.run.dir={folder}", *overrides], cwd=ROOT, capture_output=True, text=True
+        [*line, f"hydra.run.dir='{folder}'", *overrides], cwd=ROOT, capture_output=True, text=True
     )
 
 
