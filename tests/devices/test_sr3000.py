@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
-import signal
-import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -259,8 +256,8 @@ def test_an_exception_in_the_consumer_releases_the_camera() -> None:
 
 def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
     device = camera(loop=True, fps=2.0, usb={"timeout_ms": 1000})
-    threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT)).start()
-    with pytest.raises(KeyboardInterrupt), device:
+    received = programs.interrupted_when(lambda: device.counts.received)
+    with pytest.raises(KeyboardInterrupt), device, received:
         for _ in device:
             pass
     assert_released(device)
