@@ -181,7 +181,7 @@ def test_an_installed_part_stands_behind_toftracks_own(package: Path) -> None:
     "text", ["[toftrack.devices]\nlate = not one!\n", "[toftrack.devices]\nx", "\ufeff["]
 )
 def test_what_a_damaged_package_brings_is_left_out(package: Path, text: str) -> None:
-    (package / "site" / "mine-1.0.dist-info" / "entry_points.txt").write_text(text)
+    (package / "site" / "mine-1.0.dist-info" / "entry_points.txt").write_text(text, "utf-8")
     with pytest.raises(ToftrackError, match="there is no device=late"):
         configuration("device=late")
     assert configuration("seed=1").seed == 1
