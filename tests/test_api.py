@@ -56,18 +56,6 @@ def test_a_tracker_of_two_hands_gives_an_estimate_a_slot() -> None:
         toftrack.make_tracker("hands=2")
 
 
-def test_every_field_of_an_estimate_has_a_name() -> None:
-    """Names that other programs rely on: a change of them needs a new version."""
-    assert {field.name for field in dataclasses.fields(toftrack.Estimate)} == {
-        *("index", "timestamp_s", "state_name", "lost", "joints_m", "state", "latent", "score"),
-        *("covariance", "effective_sample_size", "compute_s", "gesture", "gesture_probability"),
-        *("pinch", "pinching", "image_size_px"),
-        *("pointing_origin_m", "pointing_direction", "confidence", "outside_rad"),
-        *("side", "side_probability", "joint_sigma_m", "joint_confidence", "joint_ok"),
-        *("landmarks", "openxr_position_m", "openxr_orientation", "openxr_radius_m"),
-    }
-
-
 @pytest.mark.parametrize(
     ("estimate", "said"),
     [
@@ -159,16 +147,6 @@ def test_a_bad_image_does_not_disturb_the_track() -> None:
         tracker.step(scene.depth_m[3] * 1000, scene.k)
     after = tracker.step(scene.depth_m[3], scene.k)
     assert (before.index, after.index, after.state_name) == (2, 3, "tracking")
-
-
-def test_a_device_is_what_the_command_line_would_open() -> None:
-    with toftrack.make_device("device=sample", "device.stop=2") as device:
-        frames = list(device)
-    assert [frame.index for frame in frames] == [0, 1]
-    assert device.camera.rectify(frames[0].depth, frames[0].radial).shape == (144, 176)
-    for overrides, words in ((["device=replay"], "device.path"), (["device.stop=101"], "101")):
-        with pytest.raises(toftrack.ToftrackError, match=words):
-            toftrack.make_device(*overrides)
 
 
 def test_a_configuration_of_one_s_own(tmp_path: Path) -> None:
