@@ -64,11 +64,6 @@ def test_encoding_what_was_decoded_gives_the_latent_back_where_no_joint_limit_in
     torch.testing.assert_close(space.encode(space.decode(latent)), latent, atol=1e-5, rtol=0)
 
 
-def test_every_kind_has_a_config() -> None:
-    configs = (Path(__file__).parents[2] / "conf" / "pose_space").glob("*.yaml")
-    assert {path.stem for path in configs} == set(KINDS)
-
-
 @of_every_kind
 def test_a_config_makes_its_space(kind: str) -> None:
     config = configuration(f"pose_space={kind}", "pose_space.dims=3")

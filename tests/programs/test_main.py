@@ -49,11 +49,6 @@ def test_long_help_names_every_group_and_choice() -> None:
     assert "  data " in front.long_help("train")
 
 
-def test_every_command_is_a_function_that_there_is() -> None:
-    for name in front._COMMANDS:
-        assert callable(front._program(name))
-
-
 @pytest.mark.parametrize(
     ("words", "reported"),
     [

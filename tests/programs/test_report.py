@@ -154,13 +154,6 @@ def test_another_figure_can_be_asked_for(sweep: Path) -> None:
         main([str(sweep), "--figure", "beauty"])
 
 
-def test_runs_without_the_figure_are_counted(tmp_path: Path, capsys) -> None:
-    for number, error in enumerate((5.0, None, 7.0)):
-        job(tmp_path, number, [f"seed={number}"], error)
-    report(tmp_path, "metrics.mean_mm")
-    assert "1 of 3 runs have no metrics.mean_mm" in capsys.readouterr().out
-
-
 def test_jobs_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for number in (10, 2, 1):
         job(tmp_path, number, [f"seed={number}"], 1.0)
