@@ -202,15 +202,6 @@ def test_summary_has_the_metrics_of_the_frames_done(tmp_path: Path) -> None:
     assert "75.0 % of the 12 visible frames" in metrics_table(summary).splitlines()[0]
 
 
-def test_an_interruption_keeps_what_is_done(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), ResultWriter(tmp_path, {}, NAMES, None) as writer:
-        writer.append((estimate(0),))
-        writer.append((estimate(1),))
-        raise KeyboardInterrupt
-    assert read_results(tmp_path / "track.npz")["joints_m"].shape == (2, 21, 3)
-    assert json.loads((tmp_path / "summary.json").read_text())["frames"] == 2
-
-
 def test_truth_is_found_by_the_frames_numbers(tmp_path: Path) -> None:
     done = [estimate(i) for i in range(3, 15) if i != 7]  # 0 to 2 were faulty, 7 came too late
     truth = truth_of([estimate(i) for i in range(20)], 20)[1:]
