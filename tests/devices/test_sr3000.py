@@ -164,19 +164,6 @@ def test_a_camera_that_is_given_up_is_reported_after_its_last_frame(fault: str, 
     assert device.emulator.open_handles == set()
 
 
-def test_unplugged_between_frames_by_hand() -> None:
-    device, indices = camera(keep="newest", loop=True, fps=200.0), []
-    with device:
-        for frame in device:
-            indices.append(frame.index)
-            if len(indices) == 5:
-                device.emulator.unplug(0.05)
-            if len(indices) == 10:
-                break
-    assert indices == sorted(set(indices))
-    assert device.counts.unplugged == 1
-
-
 def test_never_gives_up_when_asked_not_to() -> None:
     device = camera("timeout@2x20", persistence={"give_up_s": None, "first_frame_s": 0.1}, stop=4)
     assert [frame.index for frame in read(device)] == [0, 1, 2, 3]
