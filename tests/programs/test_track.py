@@ -223,23 +223,6 @@ def test_a_sweep_over_seeds_runs_each(tmp_path: Path) -> None:
     assert not np.array_equal(one["joints_m"], two["joints_m"])
 
 
-@pytest.mark.parametrize(
-    ("overrides", "words"),
-    [
-        (["device.start=100"], "start=100"),
-        (["device=replay", "device.path=gone.npz"], "there is no file 'gone.npz'; give the path"),
-    ],
-)
-def test_a_bad_setting_is_one_clear_sentence_before_anything_is_written(
-    here, overrides: list[str], words: str, tmp_path: Path
-) -> None:
-    status, out, err = here("view=none", *overrides)
-    assert not (tmp_path / "out" / "track.npz").exists()
-    assert (status, out) == (1, "")
-    assert err.startswith("error: ") and err.count("\n") == 1
-    assert words in err
-
-
 def test_a_view_that_cannot_come_up_leaves_no_files_and_those_that_were_there(
     here, tmp_path: Path
 ) -> None:
