@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from helpers.bags import recording, write_bag
 from helpers.hands import hand_estimate, lost_hand
-from helpers.programs import QUICK
+from helpers.programs import QUICK, free_port
 from helpers.tracking import ROOT, configuration, run
 from helpers.videos import write_grey
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -263,9 +263,7 @@ def test_the_client_of_standard_output_gets_every_frame(
 
 
 def test_the_client_of_datagrams_gets_every_frame(tmp_path: Path) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
+    port = str(free_port(socket.SOCK_DGRAM))
     assert "5005" in " ".join(word for words in TRACK for word in words)
     ready = ("while True", 'print("ready", flush=True)\nwhile True')
     with client("udp-client", tmp_path, ready, ("5005", port)) as process:
