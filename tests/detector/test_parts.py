@@ -7,7 +7,7 @@ import torch.nn.functional as F
 
 from toftrack.detector.crops import CROP_M, crop_rotation
 from toftrack.detector.network import CELLS, PARTS, SEGMENTS
-from toftrack.detector.parts import ALL_HAND, HAND_PART, UNKNOWN_PART, Parts, likeliest_parts
+from toftrack.detector.parts import UNKNOWN_PART, Parts, likeliest_parts
 
 CENTRE = np.array([0.1, -0.05, 0.5])
 TURN = crop_rotation(CENTRE, np.array([1.0, -0.4, 0.2]))
@@ -43,7 +43,3 @@ def test_a_pixel_has_the_class_of_the_part_in_which_it_is_seen_if_any(mirrored: 
     assert 0.02 < shown.mean() < 0.9
     found = Parts(kind, TURN, CENTRE, mirrored).seen(depth, asked, K)
     assert np.array_equal(found, expected)
-
-
-def test_where_nothing_is_said_all_is_the_hand() -> None:
-    assert (ALL_HAND.kind == HAND_PART).all()

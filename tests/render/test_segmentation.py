@@ -107,17 +107,15 @@ def test_without_a_tracked_hand_the_bar_in_front_is_the_nearest_surface() -> Non
         assert seen.hand.numpy()[20:30, 0:60].all()
 
 
-def test_a_hand_that_comes_nearer_is_not_its_own_occluder() -> None:
-    depth = picture(hand_m=0.5)
-    seen = nearest_surface()(depth, K, Expected(0.53, 0.58))
-    assert not seen.occluder.any()
-    assert seen.hand.numpy()[HAND].all()
-
-
-def test_a_hand_that_jumped_out_of_its_expected_depth_is_still_found() -> None:
-    """Nothing is where the hand was expected: what is in front of that cannot hide it."""
-    depth = picture(hand_m=0.5, wall_m=1.4)
-    seen = nearest_surface()(depth, K, Expected(0.8, 0.9))
+@pytest.mark.parametrize(
+    ("wall_m", "expected"),
+    [(1.0, Expected(0.53, 0.58)), (1.4, Expected(0.8, 0.9))],
+    ids=["a little", "much, and nothing is where it was expected"],
+)
+def test_a_hand_that_comes_nearer_is_not_its_own_occluder(
+    wall_m: float, expected: Expected
+) -> None:
+    seen = nearest_surface()(picture(0.5, wall_m), K, expected)
     assert not seen.occluder.any()
     assert seen.hand.numpy()[HAND].all()
 
