@@ -105,9 +105,9 @@ def _status(child: int) -> int:
 
 PROGRAM = """
 import os, sys
-import toftrack, torch
+import toftrack
 
-settings = sys.argv[2:]
+settings = sys.argv[1:]
 def follow(tracker):
     with toftrack.make_device("device=synthetic", "device.frames=3") as device:
         for frame in device:
@@ -115,9 +115,6 @@ def follow(tracker):
             estimate = tracker.step(depth_m, device.camera.K)
     return estimate.state_name
 
-if sys.argv[1] == "after":
-    torch.ones(1 << 20).exp().sum()
-    follow(toftrack.make_tracker(*settings))
 child = os.fork()
 if child == 0:
     print("child", follow(toftrack.make_tracker(*settings)), flush=True)
@@ -128,10 +125,9 @@ print("parent", follow(toftrack.make_tracker(*settings)), status, flush=True)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("when", ["before", "after"])
-def test_a_program_that_forks_goes_on_in_both_processes(when: str) -> None:
+def test_a_program_that_forks_before_it_tracks_goes_on_in_both_processes() -> None:
     process = subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, when, *QUICK],
+        [sys.executable, "-c", PROGRAM, *QUICK],
         cwd=ROOT,
         env=os.environ | {"OMP_NUM_THREADS": "2"},
         stdout=subprocess.PIPE,

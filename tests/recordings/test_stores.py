@@ -46,11 +46,6 @@ def of_folder(folder: Path, words: np.ndarray) -> Path:
     return folder / "a"
 
 
-def of_stack(folder: Path, words: np.ndarray) -> Path:
-    np.save(folder / "a.npy", words)
-    return folder / "a.npy"
-
-
 def of_kinect(folder: Path, words: np.ndarray) -> Path:
     about = videos.calibration(CAMERA.K, 512, (96, 90))
     return videos.write_kinect(folder / "a.mkv", words, words[:, ::-1], about)
@@ -67,7 +62,6 @@ KINDS: dict[str, Callable[[Path, np.ndarray], Path]] = {
     "long npz": lambda folder, words: of_npz(folder, words, np.savez_compressed),
     "srs": of_srs,
     "folder": of_folder,
-    "npy": of_stack,
     "kinect": of_kinect,
     "grey mkv": lambda folder, words: videos.write_grey(folder / "a.mkv", words),
     "grey avi": lambda folder, words: videos.write_grey(folder / "a.avi", words),
@@ -110,7 +104,7 @@ def test_frames_come_in_any_order_and_after_closing(
         np.testing.assert_allclose(depth, metres(words[number, :height, :width]), atol=6e-5)
         if amplitude is not None:
             np.testing.assert_array_equal(amplitude, words[number, :height, :width][::-1])
-        assert (amplitude is None) == (kind in ("npy", "grey mkv", "grey avi", *bags.KINDS))
+        assert (amplitude is None) == (kind in ("grey mkv", "grey avi", *bags.KINDS))
         depth[:] = 0  # the caller's own
         if number == 6:
             store.close()
