@@ -11,7 +11,6 @@ import hydra
 import numpy as np
 import pytest
 import torch
-import yaml
 from helpers import fake_orbbec
 from helpers.bags import recording, write_bag
 from helpers.tracking import CONF, ROOT, configuration
@@ -100,14 +99,6 @@ def test_every_option_composes_and_can_be_made(
         assert callable(made.func)
         if group != "view":
             hydra.utils.instantiate(part)
-
-
-def test_the_defaults_are_options_that_there_are() -> None:
-    for name in ("config", "train_pose_space", "train_detector"):
-        content = yaml.safe_load((CONF / f"{name}.yaml").read_text())
-        chosen = [e for e in content.get("defaults", []) if isinstance(e, dict)]
-        options = {pair for entry in chosen for pair in entry.items() if pair[1] is not None}
-        assert options <= set(OPTIONS)
 
 
 def test_a_calibrated_camera_reaches_every_device_that_replays(tmp_path: Path) -> None:

@@ -373,13 +373,9 @@ def test_an_error_in_code_of_ones_own_names_class_file_and_line(mine: Path) -> N
     assert status == 1 and f", in Independent.decode_freely ({path}, line {line})" in err, err
 
 
-def test_a_number_in_place_of_a_choice_is_one_sentence(tmp_path: Path) -> None:
-    for given, said in (
-        ("likelihood=Nan", "a group takes the name of one of its choices"),
-        ("~hand", "the configuration lacks hand; leave ~hand out"),
-    ):
-        status, _, err = programs.call(given, folder=tmp_path)
-        assert status == 1 and said in err and "Error" not in err
+def test_a_group_that_is_taken_away_and_needed_is_named(tmp_path: Path) -> None:
+    status, _, err = programs.call("~hand", folder=tmp_path)
+    assert status == 1 and "error: the configuration lacks hand; leave ~hand out" in err
 
 
 def test_toftrack_track_takes_a_folder_of_ones_own(mine: Path) -> None:
