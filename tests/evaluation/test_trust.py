@@ -8,13 +8,9 @@ from toftrack.evaluation.statistics import interval
 from toftrack.evaluation.trust import (
     Trust,
     judged,
-    lingering,
-    longest_run,
-    runs,
     slots_of_hands,
     tips_inset,
     trust,
-    until,
 )
 from toftrack.frames.frame import Truth
 
@@ -65,7 +61,7 @@ def test_a_hand_that_went_may_linger_for_three_frames() -> None:
 
 def test_a_hand_that_was_never_there_is_not_forgiven() -> None:
     figures = figures_of(np.zeros((4, J, 3)), flags("...x"), hand([False] * 4))
-    assert figures.silent_pct == 75
+    assert (figures.silent_pct, figures.longest_silent) == (75, 3)
     assert (figures.usable_pct, figures.visible) == (0, 0)
     assert figures.mean_mm is None and figures.mean_all_mm is None
 
@@ -133,21 +129,6 @@ def test_the_interval_holds_the_mean() -> None:
     assert interval([50.0] * 4) == (50, 50, 50)
     many = interval(list(range(100)))  # 90 %: 1.645 standard errors of 2.89 on either side
     assert (many.low, many.high) == pytest.approx((44.75, 54.25), abs=0.4)
-
-
-def test_runs() -> None:
-    assert longest_run(flags(".xx.xxx.x")) == 3
-    assert longest_run(flags("...")) == longest_run(flags("")) == 0
-    assert longest_run(flags("xx")) == 2
-    for found, expected in (
-        (lingering(flags("x....x"), 3), "xxxx.x"),
-        (lingering(flags("x"), 3), "x"),
-        (runs(flags(".xxx.xx"), 2), ".xx..x."),
-        (runs(flags(".xxx.xx"), 2, cut=True), ".xx..xx"),
-        (runs(flags(""), 3), ""),
-    ):
-        np.testing.assert_array_equal(found, flags(expected))
-    assert (until(flags("x..x"), 1), until(flags("x..."), 1)) == (2, None)
 
 
 def test_fingertips_are_moved_along_the_last_bone() -> None:
