@@ -30,12 +30,6 @@ def test_what_cannot_be_meant_is_an_error(text: str, words: str, tmp_path: Path)
             load(tmp_path / "hostile.json")
 
 
-def test_usual_content_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "usual.json"
-    path.write_text('{"é": [1, -2.5e3, true, null, 123456789012345678]}', encoding="utf-8")
-    assert read_json(path) == {"é": [1, -2500.0, True, None, 123456789012345678]}
-
-
 def test_a_file_that_is_too_large_is_not_parsed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
