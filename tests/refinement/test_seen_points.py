@@ -19,23 +19,6 @@ def observed(frame: int) -> Observation:
     return nearest_surface()(scene.depth_m[0], scene.k)
 
 
-@pytest.mark.parametrize("frame", [0, 40, 80])
-def test_the_points_are_those_of_the_hand_without_its_edges(frame: int) -> None:
-    observation = observed(frame)
-    seen = seen_points(observation)
-    assert 100 < len(seen.points_m) < int(observation.hand.sum())
-    pixel = (seen.points_m @ seen.k.T)[:, :2]
-    u, v = (pixel / seen.points_m[:, 2:]).round().long().T
-    assert observation.hand[v, u].all()
-    torch.testing.assert_close(observation.depth_m[v, u], seen.points_m[:, 2])
-    rows = (v[:, None] + torch.tensor([-1, 0, 1])).clamp(max=len(observation.depth_m) - 1)
-    around = observation.depth_m[rows, u[:, None]]
-    assert (around.amax(1) - around.amin(1) < 0.03).all()
-    # On the silhouette the nearest pixel of the row that is not background is the pixel itself.
-    top, left = seen.corner
-    assert torch.equal(seen.beside[v - top, u - left] + left, u.int())
-
-
 @pytest.mark.parametrize("share", [0.0005, 0.01, 0.6])
 def test_the_nearest_pixel_that_is_not_background_is_found(share: float) -> None:
     draw = np.random.default_rng(1)
@@ -55,7 +38,7 @@ def test_the_nearest_pixel_that_is_not_background_is_found(share: float) -> None
 @pytest.mark.parametrize("shape", [(0, 0), (1, 1), (1, 7), (60, 80)])
 def test_points_are_those_of_plain_loops(shape: tuple[int, int]) -> None:
     draw = np.random.default_rng(0)
-    depth = 0.5 + 0.02 * draw.random(shape, np.float32)
+    depth = 0.5 + 0.04 * draw.random(shape, np.float32)
     depth[draw.random(shape) < 0.1] = 0
     hand = (draw.random(shape) < 0.7) & (depth > 0)
     k = np.array([[200.0, 0, 44], [0, 210, 33], [0, 0, 1]], np.float32)
