@@ -208,6 +208,7 @@ def test_exact_corners_give_the_exact_lens_and_planes() -> None:
         (["--board", "7", "--square", "0.03"], "COLUMNSxROWS"),
         (["--board", "7x5", "--square", "30"], "metres"),
         (["--board", "9x6", "--square", "0.03", "--frames", "3"], "no 9x6 chequerboard"),
+        (["--board", "7x5", "--square", "0.025", "--frames", "10"], "0.83 times as far apart"),
     ],
 )
 def test_errors_are_one_sentence(
@@ -224,6 +225,41 @@ def test_errors_are_one_sentence(
     last = capfd.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("error: ")
     assert words in last
+
+
+def corners_of(poses: list[tuple[np.ndarray, np.ndarray]]) -> list[View]:
+    """The corners that TRUE sees, found as well as they are: to 0.05 pixels."""
+    points, rng, views = calibration.board_points(BOARD, SQUARE_M), np.random.default_rng(1), []
+    for index, (rotation, middle) in enumerate(poses):
+        origin, turn = middle - rotation @ points.mean(0), cv2.Rodrigues(rotation)[0]
+        pixels, _ = cv2.projectPoints(points, turn, origin, TRUE.K, TRUE.distortion)
+        noise = rng.normal(0, 0.05, (len(points), 2))
+        views.append(View(index, pixels.reshape(-1, 2) + noise))
+    return views
+
+
+def test_boards_that_are_hardly_turned_are_refused() -> None:
+    # Any focal length fits them: 2600 pixels came out here, of 210, without a word.
+    middles = [middle for _, middle in board_poses(20, 0.35, 1.2)]
+    slanted = cv2.Rodrigues(np.array([0.5, 0.0, 0.0]))[0]
+    for rotation in (np.eye(3), slanted):
+        views = corners_of([(rotation, middle) for middle in middles])
+        with pytest.raises(ToftrackError, match="turned in all directions"):
+            calibration.fit_lens(views, BOARD, SQUARE_M, nominal_camera())
+
+
+def test_large_images_are_searched_once_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    searched: list[tuple[int, ...]] = []
+
+    def find(image: np.ndarray, *_: object) -> tuple[bool, None]:
+        searched.append(image.shape)
+        return False, None
+
+    monkeypatch.setattr(cv2, "findChessboardCornersSB", find)
+    for height, width in ((144, 176), (720, 1280)):
+        ramp = np.tile(np.arange(width, dtype=np.uint16), (height, 1))
+        assert calibration.find_corners(ramp, BOARD) is None
+    assert searched == [(720, 880), (432, 528), (1008, 1232), (731, 1300)]
 
 
 def test_a_recording_without_amplitude_is_reported(tmp_path: Path) -> None:

@@ -24,12 +24,18 @@ _ORDERS = range(1, 8)
 # Enlargements, tried in turn: the finder wants squares of more than a few pixels, and puts corners
 # least off at 5 (the focal length by 0.1 %, at 3 by 0.2 %).
 _SCALES = (5, 3, 7)
+_LARGEST_PX = 1300
+"""What is wider shows all corners as it is; enlarged it would take a minute an image."""
 _QUICK_SCALE, _QUICK_PX = 5, 900
 """A first look enlarges less where an image would be wider than this: 0.2 s an image."""
 _FEWEST_VIEWS = 5
 _FOLDS = 5
 _STEP_M = 0.1  # of true distance, within which pixels are averaged
 _OUTLIER = 3.0  # times the median reprojection error
+_TURNED_DEG = 20.0
+"""Between the most different boards at least: less turned, they fit any focal length."""
+_STRETCH = 1.18
+"""Of true distances by measured ones: no camera is so wrong over the range of a board."""
 _UNDETERMINED = (
     "the corners do not determine the camera; show the board turned in all directions, near and far"
 )
@@ -97,7 +103,8 @@ def find_corners(amplitude: np.ndarray, board: tuple[int, int]) -> np.ndarray | 
     None when the board is not, or not wholly, in view.
     """
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY
-    for scale in _SCALES:
+    most = max(1.0, _LARGEST_PX / amplitude.shape[1])
+    for scale in dict.fromkeys(min(scale, most) for scale in _SCALES):
         grey = _enlarged(amplitude, scale)
         if grey is None:
             return None
@@ -158,6 +165,9 @@ def fit_lens(views: Sequence[View], board: tuple[int, int], square_m: float, gue
         views = [view for view, keep in zip(views, good, strict=True) if keep]
     K[0, 1] = 0.0
     if not (np.isfinite(K).all() and K[0, 0] > 0 and K[1, 1] > 0):
+        raise ToftrackError(_UNDETERMINED)
+    normals = np.stack([cv2.Rodrigues(rvec)[0][:, 2] for rvec in rvecs])
+    if (normals @ normals.T).min() > np.cos(np.radians(_TURNED_DEG)):
         raise ToftrackError(_UNDETERMINED)
     camera = Camera(K, guess.width, guess.height, distortion.ravel()[:5])
     return _lens(camera, views, rvecs, tvecs, errors)
@@ -259,7 +269,7 @@ def pixel_errors(pairs: DepthPairs, polynomial: tuple[float, ...] = ()) -> np.nd
 
 def fit_depth(pairs: DepthPairs) -> DepthFit:
     """The polynomial whose order predicts left-out frames best, by weighted least squares;
-    ToftrackError where the boards are all at about one distance.
+    ToftrackError where the boards are all at about one distance, or are not of the size given.
     """
     pairs = _averaged(pairs)
     used = np.unique(pairs.view)
@@ -268,6 +278,14 @@ def fit_depth(pairs: DepthPairs) -> DepthFit:
         raise ToftrackError(
             f"the boards lie between {near:.2f} and {far:.2f} m in {len(used)} frames, which is "
             "too little to correct the depth; show the board near and far"
+        )
+    everything = np.ones(len(pairs.view), bool)
+    stretch = 1 + _fit(pairs, everything, 1, near, far)[1]
+    if not 1 / _STRETCH < stretch < _STRETCH:
+        raise ToftrackError(
+            f"by their corners the boards are {stretch:.2g} times as far apart as the depth says; "
+            "check --square (metres), a .srs's --modulation and the depth's unit, and turn the "
+            "board in all directions"
         )
     fold = np.searchsorted(used, pairs.view) % _FOLDS
     validation = {}
@@ -282,7 +300,7 @@ def fit_depth(pairs: DepthPairs) -> DepthFit:
             total += len(error)
         validation[order] = 1000 * float(np.sqrt(square / total))
     order = min(validation, key=validation.__getitem__)
-    polynomial = _fit(pairs, np.ones(len(pairs.view), bool), order, near, far)
+    polynomial = _fit(pairs, everything, order, near, far)
     return DepthFit(polynomial, (near, far), order, validation)
 
 
