@@ -46,6 +46,20 @@ def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
     assert np.allclose(place, first.openxr_position_m[metacarpal], atol=2e-6)
 
 
+@pytest.mark.parametrize(
+    "times",
+    [
+        [0, 0.04, 0.08, 0.12, 1.7e9, 1.7e9 + 0.04],  # the clock was set
+        [4294.9, 4294.94, 0.01, 0.05, 0.09, 0.13],  # 32 bits of microseconds
+        [0, 0, 0.08, 0.08, 0.16, 0.16, 0.24],  # one stamp for two frames
+    ],
+)
+def test_a_clock_that_errs_leaves_frames_of_even_length(times: list[float]) -> None:
+    estimates = [replace(one, timestamp_s=at) for one, at in zip(moving(), times, strict=False)]
+    (motion,) = motions_of(results_of(estimates), (default_hand_shape(),))
+    assert np.allclose(motion.time_s, 0.04 * np.arange(len(times)))
+
+
 def test_the_skin_follows_the_joints() -> None:
     """Skinned by the rules of the format, the tip of the mesh is the tip of the finger."""
     estimates = moving("left")

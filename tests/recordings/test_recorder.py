@@ -252,11 +252,13 @@ def test_what_is_removed_while_it_grows_is_one_sentence_and_nobody_waits(
     assert "was removed or renamed while the recording grew" in (recorder.ended or "")
 
 
-def test_times_never_go_back(tmp_path: Path) -> None:
-    times = [5.0, 5.1, 2.0, 2.1, np.nan, 2.3]
+def test_times_never_go_back_nor_leap(tmp_path: Path) -> None:
+    # A RealSense's may leap: its first frames by its own clock, the others by the host's.
+    times = [5.0, 5.1, 2.0, 2.1, np.nan, 2.3, 1.7e9, 1.7e9 + 40]
     recorded(tmp_path / "hand.npz", *(one_frame(timestamp_s=time) for time in times))
     step = 1 / 30
     expected = [5.0, 5.1, 5.1 + step, 5.2 + step, 5.2 + 2 * step, 5.4 + step]
+    expected += [5.4 + 2 * step, 45.4 + 2 * step]
     np.testing.assert_allclose(read_recording(tmp_path / "hand.npz").timestamp_s, expected)
 
 

@@ -18,6 +18,7 @@ import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
+from toftrack.compute.pace import FRAME_S, LEAP_S
 from toftrack.errors import ToftrackError, module_of_extra
 from toftrack.hand.openxr import (
     JOINT_OF_FRAME,
@@ -134,11 +135,11 @@ def _smooth_signum(turn: np.ndarray) -> np.ndarray:
 
 
 def _times(timestamp_s: np.ndarray) -> np.ndarray:
-    """(T,) from 0 on; where time stands still or goes back, frames of even length."""
+    """(T,) from 0 on; where time stands still, goes back or leaps, frames of even length."""
     steps = np.diff(timestamp_s)
-    if not (steps > 0).all():
-        step = float(np.median(steps[steps > 0])) if (steps > 0).any() else 1 / 25
-        return step * np.arange(len(timestamp_s))
+    if not ((steps > 0) & (steps < LEAP_S)).all():
+        usual = steps[(steps >= 0) & (steps < LEAP_S)]
+        return (float(usual.mean()) if usual.any() else FRAME_S) * np.arange(len(timestamp_s))
     return timestamp_s - timestamp_s[:1]
 
 

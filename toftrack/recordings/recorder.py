@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
+from toftrack.compute.pace import LEAP_S
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import check_replaceable
 from toftrack.frames.camera import Camera
@@ -239,7 +240,8 @@ class Recorder:
 
 
 class _Clock:
-    """Times that do not go back: a camera that counts anew goes on a frame after the one before."""
+    """Times that neither go back nor leap: where a camera counts anew, they go on a frame after the
+    one before."""
 
     def __init__(self) -> None:
         self._offset_s, self._latest_s = 0.0, -math.inf
@@ -247,8 +249,10 @@ class _Clock:
     def at(self, time_s: float, fps: float) -> float:
         """The time of the next frame."""
         shifted_s = time_s + self._offset_s
-        if not math.isfinite(shifted_s) or shifted_s < self._latest_s:
-            before_s = self._latest_s if math.isfinite(self._latest_s) else 0.0
+        begun = math.isfinite(self._latest_s)
+        most_s = self._latest_s + LEAP_S if begun else math.inf
+        if not math.isfinite(shifted_s) or not self._latest_s <= shifted_s < most_s:
+            before_s = self._latest_s if begun else 0.0
             shifted_s = before_s + 1 / fps
             if math.isfinite(time_s):
                 self._offset_s = shifted_s - time_s
