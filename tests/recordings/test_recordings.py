@@ -69,6 +69,15 @@ def test_reads_every_key(tmp_path: Path) -> None:
     assert len(recording) == T
 
 
+def test_most_of_the_image_may_be_65535_millimetres_for_no_reading(tmp_path: Path) -> None:
+    depth = np.full((T, H, W), 65.535)
+    for kind in (np.float16, np.float32):
+        assert len(read_recording(save(tmp_path, depth_m=depth.astype(kind)))) == T
+        depth[:, : H // 3] = 0.7
+    depth[:, : H // 3] = 700.0
+    assert "median of 'depth_m' is 700" in complaint(save(tmp_path, depth_m=depth))
+
+
 def test_two_keys_are_enough(tmp_path: Path) -> None:
     path = tmp_path / "least.npz"
     np.savez(path, depth_m=np.ones((T, H, W), np.float16), K=K)
@@ -212,7 +221,7 @@ IMAGES = np.ones((T, H, W), np.float32)
         ("visible", np.ones(T + 1, bool), ""),
         ("amplitude", np.ones((T, H, W - 1), np.uint16), ""),
         ("timestamp_s", np.arange(T - 1.0), ""),
-        ("timestamp_s", np.array([0.0, 0.1, 0.05, 0.2]), ""),
+        ("timestamp_s", np.array([0.0, 0.1, 0.05, 0.2]), "frame 2; .*'fps'"),
         ("fps", 0.0, ""),
         ("distortion", np.zeros(3), ""),
         ("metadata", "no json", ""),

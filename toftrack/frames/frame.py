@@ -16,11 +16,12 @@ from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
-_FULL_WORD_M = 65.535
-"""What many cameras say in millimetres where there is no reading, as everywhere before a covered
-lens."""
-_MILLIMETRES = (100.0, 20_000.0)
-"""A median between these is one of millimetres, unless they are centimetres."""
+_FULL_WORD, _NEAR_FULL = (65.535, 65_535.0), 1e-3
+"""What many cameras say in metres or millimetres where there is no reading, as everywhere before a
+covered lens; relatively so near, as float16 has it."""
+_MILLIMETRES, _FARTHEST_MM = (100.0, 20_000.0), 4000.0
+"""A median between these is one of millimetres, unless they are centimetres, or all is farther than
+hands are: some cameras count tenths of millimetres."""
 _NEAREST_CM, _LARGEST_CM = (15.0, 120.0), 1000.0
 """What is nearest in centimetres, and no median is more: as millimetres, these would be nearer than
 cameras measure."""
@@ -38,7 +39,7 @@ def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
     given = whole if kind else f"the median of {what}"
     if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
         unit, to_metres = "centimetres", 100
-    elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1]:
+    elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1] and nearest < _FARTHEST_MM:
         unit, to_metres = "millimetres", 1000
     else:
         return ToftrackError(
@@ -62,8 +63,10 @@ def nearest_reading(depth: np.ndarray) -> float:
 
 
 def _percentile(depth: np.ndarray, percent: float) -> float:
-    readings = depth[(depth > 0) & (depth < np.inf)]
-    return float(np.percentile(readings.astype(np.float32), percent)) if readings.size else 0.0
+    readings = depth[(depth > 0) & (depth < np.inf)].astype(np.float32)
+    for full in _FULL_WORD:
+        readings = readings[abs(readings - full) > _NEAR_FULL * full]
+    return float(np.percentile(readings, percent)) if readings.size else 0.0
 
 
 @fields_in_help
@@ -185,8 +188,7 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
     if farthest == np.inf:
         depth = np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
         farthest = largest_reading(depth)
-    median = median_reading(depth) if farthest > LARGEST_MEDIAN_M else 0.0
-    if median > LARGEST_MEDIAN_M and not math.isclose(median, _FULL_WORD_M, rel_tol=1e-6):
+    if farthest > LARGEST_MEDIAN_M and median_reading(depth) > LARGEST_MEDIAN_M:
         raise wrong_unit("the depth image", depth)
     if matrix.shape != (3, 3) or matrix.dtype != np.float64:
         return depth, Camera(matrix, depth.shape[1], depth.shape[0]).K

@@ -314,8 +314,12 @@ def _times(arrays: dict[str, Any], count: int, given: float | None) -> tuple[np.
         fps = fps or given or DEFAULT_FPS
         return np.arange(count) / fps, fps
     timestamp_s = _shaped(arrays, "timestamp_s", (count,)).astype(np.float64)
-    if not np.isfinite(timestamp_s).all() or (np.diff(timestamp_s) < 0).any():
-        raise ToftrackError("'timestamp_s' must be finite and must not go backwards")
+    sound = np.append(True, np.diff(timestamp_s) >= 0) & np.isfinite(timestamp_s)
+    if not sound.all():
+        raise ToftrackError(
+            "'timestamp_s' must be finite and must not go backwards, as it does at frame "
+            f"{sound.argmin()}; repair it, or leave it out and give 'fps'"
+        )
     return timestamp_s, rate_of(timestamp_s, DEFAULT_FPS if fps is None else fps)
 
 
