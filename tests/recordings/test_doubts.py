@@ -25,7 +25,13 @@ TIMES = np.array([0, 0.033, 0.067, 0.1, 0.133, 0.5])
 
 @pytest.mark.parametrize(
     ("factor", "words"),
-    [(1e3, "divide them by 1000,"), (1e9, "nanoseconds"), (1e-3, "multiply them by")],
+    [
+        (1e3, "divide them by 1000,"),
+        (1e6, "microseconds"),
+        (1e7, "divide them by 10000000,"),
+        (1e9, "nanoseconds"),
+        (1e-3, "multiply them by"),
+    ],
 )
 def test_times_in_another_unit_are_reported_with_the_factor(factor: float, words: str) -> None:
     assert words in times_doubt(TIMES * factor + 17)

@@ -27,10 +27,12 @@ _STEP_S, _FASTEST_S = (0.005, 5.0), 0.0005
 _TIME_UNITS = (
     ("milliseconds", 1e3),
     ("microseconds", 1e6),
+    ("a Kinect's ticks of 100 ns", 1e7),
     ("nanoseconds", 1e9),
     ("thousands of seconds", 1e-3),
 )
-"""Names of units and how many of them a second has, the likeliest first."""
+"""Names of units and how many of them a second has: that is meant which is nearest to this rate."""
+_USUAL_FPS = 30.0
 _LONG_STEP = 1.5
 """Times the usual step between frames, beyond which some are missing."""
 _MOST_NAMED = 10
@@ -107,14 +109,14 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
     step = float(np.median(steps[steps > 0]))
     if _FASTEST_S <= step < _STEP_S[1]:
         return ""
-    for unit, in_a_second in _TIME_UNITS:
-        if _STEP_S[0] <= step / in_a_second < _STEP_S[1]:
-            right = f"divide them by {in_a_second:.0f}"
-            if in_a_second < 1:
-                right = f"multiply them by {1 / in_a_second:.0f}"
-            what = f"the time stamps look like {unit}: their median step is {step:.6g}"
-            return f"{what}; {right}, {remedy}"
-    return ""
+    unit, in_a_second = min(_TIME_UNITS, key=lambda one: abs(np.log(step / one[1] * _USUAL_FPS)))
+    if not _STEP_S[0] <= step / in_a_second < _STEP_S[1]:
+        return ""
+    right = f"divide them by {in_a_second:.0f}"
+    if in_a_second < 1:
+        right = f"multiply them by {1 / in_a_second:.0f}"
+    what = f"the time stamps look like {unit}: their median step is {step:.6g}"
+    return f"{what}; {right}, {remedy}"
 
 
 def gaps_doubt(timestamp_s: np.ndarray) -> str:
