@@ -64,6 +64,15 @@ def test_frames_are_metres_infrared_and_seconds(plug: Plug) -> None:
     device.close()
 
 
+def test_where_the_camera_tells_no_time_it_is_that_of_arrival(plug: Plug) -> None:
+    camera = a_camera(numbers=(70, 71))
+    for images in camera.sets:
+        images.get_depth_frame().values["timestamp_us"] = 0
+    plug(camera)
+    times = [frame.timestamp_s for frame in orbbec(keep="every", stop=2)]
+    assert times == pytest.approx([9.07, 9.071])
+
+
 @pytest.mark.parametrize("infrared", [LEFT_IR, None])
 def test_infrared_is_the_left_cameras_or_none(plug: Plug, infrared: str | None) -> None:
     plug(a_camera(numbers=(1,), infrared=infrared))

@@ -56,6 +56,7 @@ def image(number: int, dtype: Any = np.uint16, few: bool = False) -> Getters:
     return Getters(
         index=number,
         timestamp_us=5_000_000 + 1000 * number,
+        system_timestamp_us=9_000_000 + 1000 * number,
         depth_scale=0.25,
         format="y8" if dtype == np.uint8 else "y16",
         width=8,

@@ -172,11 +172,14 @@ class Orbbec(SdkCamera):
             # Y8 has one byte a pixel, Y16 two.
             eight = infrared.get_format() == self._ob.OBFormat.Y8
             amplitude = _words(infrared, np.dtype("u1" if eight else "<u2")).astype(np.uint16)
+        # The camera's time comes with the images' metadata, and is 0 where the system has none of
+        # those, as Windows before it is registered: the time of arrival is what there is.
+        time_us = depth.get_timestamp_us() or depth.get_system_timestamp_us()
         # The SDK's unit is the millimetre.
         scale_m = np.float32(1e-3 * depth.as_depth_frame().get_depth_scale())
         return Frame(
             index=index,
-            timestamp_s=depth.get_timestamp_us() / 1e6,
+            timestamp_s=time_us / 1e6,
             depth=words.astype(np.float32) * scale_m,
             amplitude=amplitude,
             radial=False,
