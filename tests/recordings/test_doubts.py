@@ -29,6 +29,7 @@ TIMES = np.array([0, 0.033, 0.067, 0.1, 0.133, 0.5])
         (1e3, "divide them by 1000,"),
         (1e6, "microseconds"),
         (1e7, "divide them by 10000000,"),
+        (6e7, "divide them by 60000000,"),
         (1e9, "nanoseconds"),
         (1e-3, "multiply them by"),
     ],

@@ -27,7 +27,8 @@ _STEP_S, _FASTEST_S = (0.005, 5.0), 0.0005
 _TIME_UNITS = (
     ("milliseconds", 1e3),
     ("microseconds", 1e6),
-    ("a Kinect's ticks of 100 ns", 1e7),
+    ("a Kinect V2's ticks of 100 ns", 1e7),
+    ("a Kinect V1's ticks, 60 a microsecond", 6e7),
     ("nanoseconds", 1e9),
     ("thousands of seconds", 1e-3),
 )
