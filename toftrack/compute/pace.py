@@ -12,8 +12,6 @@ FRAME_S = 1 / 25
 """What "a frame" means in settings."""
 _SHORTEST_S, _LONGEST_S = 1 / 120, 0.5
 """The time that is reckoned with: a clock may be coarse, and no prediction reaches farther."""
-LEAP_S = 3600.0
-"""No camera pauses for so long: a clock was set, or the host's took the place of the camera's."""
 
 
 def elapsed_s(before_s: float | None, now_s: float) -> float:

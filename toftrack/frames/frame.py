@@ -25,6 +25,8 @@ hands are: some cameras count tenths of millimetres."""
 _NEAREST_CM, _LARGEST_CM = (15.0, 120.0), 1000.0
 """What is nearest in centimetres, and no median is more: as millimetres, these would be nearer than
 cameras measure."""
+LEAP_S = 3600.0
+"""No camera pauses for so long: a clock was set, or the host's took the place of the camera's."""
 _NEAREST_PERCENT = 5
 """So many percent of the readings may be nearer than what is called the nearest."""
 

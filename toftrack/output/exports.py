@@ -18,8 +18,8 @@ import torch
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from toftrack.compute.pace import FRAME_S, LEAP_S
 from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.frames.frame import LEAP_S
 from toftrack.hand.openxr import (
     JOINT_OF_FRAME,
     OPENXR_JOINT_NAMES,
@@ -139,7 +139,7 @@ def _times(timestamp_s: np.ndarray) -> np.ndarray:
     steps = np.diff(timestamp_s)
     if not ((steps > 0) & (steps < LEAP_S)).all():
         usual = steps[(steps >= 0) & (steps < LEAP_S)]
-        return (float(usual.mean()) if usual.any() else FRAME_S) * np.arange(len(timestamp_s))
+        return (float(usual.mean()) if usual.any() else 1 / 25) * np.arange(len(timestamp_s))
     return timestamp_s - timestamp_s[:1]
 
 

@@ -16,12 +16,12 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from toftrack.compute.pace import LEAP_S
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import check_replaceable
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import (
     LARGEST_MEDIAN_M,
+    LEAP_S,
     SMALLEST_MEDIAN_M,
     Frame,
     median_reading,
