@@ -118,7 +118,7 @@ def test_reads_frames_and_sets_the_camera_up(
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
-        ("open", "found no camera"),
+        ("open", "found no camera with the serial number 0x4000002f that"),
         ("rows", "176x200"),
         ("modulation", "SR_SetModulationFrequency"),
         ("acquire", "sent no frame.*SR_Acquire"),
@@ -128,8 +128,9 @@ def test_what_goes_wrong_is_reported(
     libraries: Libraries, fault: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("STAND_IN_FAULT", fault)
-    with pytest.raises(ToftrackError, match=words), camera(libraries["whole"]) as device:
-        list(device)
+    with pytest.raises(ToftrackError, match=words):
+        with camera(libraries["whole"], serial="0x4000002f") as device:
+            list(device)
 
 
 @pytest.mark.parametrize(("fault", "unanswered"), [("once", 1), ("gone", 2)])

@@ -55,7 +55,7 @@ class MesaTransport:
         camera = _CAMERA()
         opened = library.SR_OpenUSB(ctypes.byref(camera), self._serial)
         if opened <= 0 or not camera.value:
-            wanted = f" with the serial number {self._serial}" if self._serial else ""
+            wanted = f" with the serial number {self._serial:#010x}" if self._serial else ""
             raise ToftrackError(
                 f"the vendor's library found no camera{wanted} that it can open (SR_OpenUSB gave "
                 f"{opened}): plug the camera in and switch it on, close other programs that use "
