@@ -46,6 +46,12 @@ def _made() -> Kernel:
     return doubled
 
 
+def _kept(kernel: Kernel) -> str:
+    """Where its code is kept."""
+    path: str = compiling._cached(kernel.function, kernel.options).stats.cache_path
+    return path
+
+
 def _is_loaded() -> bool:
     """Run the kernel in a new process, which must work; whether its code was on the disk."""
     kernel, values = _made(), np.arange(3.0)
@@ -177,7 +183,7 @@ def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
 def test_what_another_process_is_compiling_is_waited_for() -> None:
     values, kernel = np.arange(3.0), _made()
     assert not _is_loaded()
-    with filelock.FileLock(f"{compiling._cached(kernel.function).stats.cache_path}.lock"):
+    with filelock.FileLock(f"{_kept(kernel)}.lock"):
         waits = threading.Thread(target=kernel, args=(values,))
         waits.start()
         waits.join(0.5)
@@ -190,7 +196,7 @@ def test_what_another_process_never_finishes_is_compiled_all_the_same(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(compiling, "_PATIENCE_S", 0.1)
-    with filelock.FileLock(f"{compiling._cached(_made().function).stats.cache_path}.lock"):
+    with filelock.FileLock(f"{_kept(_made())}.lock"):
         assert not _is_loaded()
 
 

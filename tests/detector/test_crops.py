@@ -22,6 +22,7 @@ from toftrack.detector.crops import (
     crop_at,
     crop_rotation,
     wide,
+    wide_channels,
 )
 from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.hand_detector import HandDetector
@@ -152,6 +153,15 @@ def test_the_whole_image_keeps_its_rays() -> None:
         ray = ((u - new_k[0, 2]) / new_k[0, 0], (v - new_k[1, 2]) / new_k[1, 1])
         true = ((column - k[0, 2]) / focal, (row - k[1, 2]) / focal)
         assert ray == pytest.approx(true, abs=1.0 / WIDE_F_PX)
+
+
+@pytest.mark.parametrize("height", [48, 50])
+def test_the_whole_image_is_seen_as_in_training_and_nothing_beyond_it(height: int) -> None:
+    depth = np.random.default_rng(0).uniform(-1.0, 2.0, (height, 80)).astype(np.float32)
+    image, new_k = wide(depth, k := intrinsics(WIDE_F_PX, height, 80))
+    beyond = (0, 0, 0, -height % WIDE_MULTIPLE)
+    expected = wide_channels(torch.nn.functional.pad(torch.from_numpy(depth)[None], beyond))
+    assert torch.equal(image, expected) and np.array_equal(new_k, k)
 
 
 def test_a_view_as_wide_as_the_sky_is_seen_small() -> None:

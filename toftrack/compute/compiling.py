@@ -29,9 +29,8 @@ from toftrack.compute.collector import collector_paused
 
 log = logging.getLogger(__name__)
 
-OPTIONS = {
+OPTIONS: dict[str, Any] = {
     "fastmath": {"contract", "arcp", "nsz"},
-    "nogil": True,
     "error_model": "numpy",
     "no_cfunc_wrapper": True,
 }
@@ -51,9 +50,9 @@ _said: set[str] = set()
 class Kernel:
     """A compiled function that Python calls: compiled, or taken from the cache, the first time."""
 
-    def __init__(self, function: Callable) -> None:
+    def __init__(self, function: Callable, nogil: bool = False) -> None:
         functools.update_wrapper(self, function)
-        self.function = function
+        self.function, self.options = function, OPTIONS | {"nogil": nogil}
         self.dispatcher: Any = None
 
     @property
@@ -65,7 +64,7 @@ class Kernel:
         if self.is_compiled:
             return self._run(args)
         with lock, collector_paused():
-            self.dispatcher = self.dispatcher or _cached(self.function)
+            self.dispatcher = self.dispatcher or _cached(self.function, self.options)
             _announce(self.dispatcher)
             with _only_one_process(self.dispatcher.stats.cache_path):
                 return self._run(args)
@@ -86,12 +85,18 @@ class Kernel:
             self.dispatcher.recompile()  # empties what numba has kept of it
             return self.dispatcher(*args)
         except OSError:
-            self.dispatcher = numba.njit(**OPTIONS)(self.function)
+            self.dispatcher = numba.njit(**self.options)(self.function)
             return self.dispatcher(*args)
 
 
 entry_point = Kernel
-"""Decorator of the functions that Python calls."""
+"""Decorator of the functions that Python calls. They keep the interpreter's lock, which they would
+wait for longer than they run; long ones, and those that threads share, are shared_entry_point."""
+
+
+def shared_entry_point(function: Callable) -> Kernel:
+    """An entry point that lets go of the interpreter's lock meanwhile."""
+    return Kernel(function, nogil=True)
 
 
 @contextlib.contextmanager
@@ -112,19 +117,19 @@ def _only_one_process(cache_path: str | None) -> Iterator[None]:
         beside.release()
 
 
-def _cached(function: Callable) -> Any:
+def _cached(function: Callable, options: dict[str, Any]) -> Any:
     """numba's function with a cache, or without one where it cannot be trusted or written."""
     before = _config.CACHE_DIR
     try:
         folder = _private_folder() / _fingerprint(function)
         _config.CACHE_DIR = str(folder)
-        dispatcher = numba.njit(**OPTIONS, cache=True)(function)
+        dispatcher = numba.njit(**options, cache=True)(function)
         if not Path(dispatcher.stats.cache_path).is_relative_to(folder):
             raise PermissionError(f"'{folder}' cannot be written")
         return dispatcher
     except (OSError, RuntimeError) as error:  # no home, no source file
         _say_once(error)
-        return numba.njit(**OPTIONS)(function)
+        return numba.njit(**options)(function)
     finally:
         _config.CACHE_DIR = before
 

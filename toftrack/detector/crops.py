@@ -6,13 +6,14 @@ points of a grid; nothing is interpolated over depth edges.
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, entry_point, shared_entry_point
 
 CROP_M = 0.30
 """Side of the cube that a crop shows."""
@@ -57,10 +58,10 @@ def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:
 
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-_LEAST_SLOPE = np.float32(0.05)
+_LEAST_SLOPE, _RANGE = np.float32(0.05), float(np.float32(WIDE_RANGE_M))
 
 
-@entry_point
+@shared_entry_point
 def crop_at(depth, mirror, k, centre, turn, image):
     """What is in the cube about a centre (3,), turned by (3, 3), see crop_rotation.
 
@@ -145,7 +146,18 @@ def _place(shape, flip, mapping, slope, line, places, share):
 
 def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
     """The whole image as the finder sees it, (1, 2, h, w), and its intrinsics (3, 3)."""
-    height, width = depth_m.shape
+    rows, columns, new_k = _wide_grid(depth_m.shape, k.astype(np.float64).tobytes())
+    image = np.empty((1, 2, len(rows), len(columns)), np.float32)
+    _read_wide(depth_m, rows, columns, image[0])
+    return torch.from_numpy(image), new_k
+
+
+@functools.lru_cache(4)
+def _wide_grid(size: tuple[int, int], entries: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The rows (h,) and columns (w,) that `wide` reads of an image of a size with the entries of a
+    (3, 3) float64 k, and its own intrinsics (3, 3).
+    """
+    (height, width), k = size, np.frombuffer(entries).reshape(3, 3)
     focal = np.minimum(WIDE_F_PX, k.diagonal()[:2] * WIDE_LARGEST_PX / (width, height))
     scale = focal / k.diagonal()[:2]
     # A multiple, for the network's strides; what is added has no reading.
@@ -153,11 +165,8 @@ def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
         WIDE_MULTIPLE * int(np.ceil(s * f / WIDE_MULTIPLE - 1e-9))
         for s, f in zip((width, height), scale, strict=True)
     )
-    u = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
-    v = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
-    read = np.zeros((h, w), np.float32)
-    rows, columns = v < height, u < width
-    read[np.ix_(rows, columns)] = depth_m[np.ix_(v[rows], u[columns])]
+    columns = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
+    rows = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
     new_k = np.array(
         [
             [focal[0], 0, (k[0, 2] + 0.5) * scale[0] - 0.5],
@@ -165,7 +174,23 @@ def wide(depth_m: np.ndarray, k: np.ndarray) -> tuple[Tensor, np.ndarray]:
             [0, 0, 1],
         ]
     )
-    return wide_channels(torch.from_numpy(read)[None]), new_k
+    return rows, columns, new_k
+
+
+@entry_point
+def _read_wide(depth, rows, columns, image):
+    """The readings at rows (h,) and columns (w,) into `image` (2, h, w), see wide_channels; none
+    beyond the last row or column.
+    """
+    height, last = depth.shape[0], depth.shape[1] - 1
+    for v in range(len(rows)):
+        row = depth[min(rows[v], height - 1)]
+        for u in range(len(columns)):
+            inside = (rows[v] < height) & (columns[u] <= last)
+            z = row[min(columns[u], last)]
+            read = inside & (z > _ZERO)
+            image[0, v, u] = min(z / _RANGE, 1.0) if read else _ONE
+            image[1, v, u] = _ONE if read else _ZERO
 
 
 def wide_channels(read_m: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, shared_entry_point
 from toftrack.compute.rigid import PIVOT_M
 from toftrack.compute.rigid_numba import pose_hand, quaternion_of, rotation_vector
 from toftrack.detector.crops import CROP, CROP_M
@@ -33,7 +33,7 @@ _LIMITS = np.array(ANGLE_LIMITS)
 _PIVOT = np.array(PIVOT_M)
 
 
-@entry_point
+@shared_entry_point
 def decode_at(heads, keypoints, depth, turn, centre, mirror, hand, out):
     """What the network's outputs for a crop mean, see PoseNet.decode.
 

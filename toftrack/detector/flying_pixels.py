@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, shared_entry_point
 from toftrack.compute.threads import run_shared
 
 _FAR = np.float32(np.inf)
@@ -39,7 +39,7 @@ def without_flying_pixels(depth_m: np.ndarray, k: np.ndarray, widths: float) -> 
     return left
 
 
-@entry_point
+@shared_entry_point
 def _sweep(depth, part, first, end, left):
     """Rows `first` to `end` of an image, see above, into `left`.  part: of a depth.
 

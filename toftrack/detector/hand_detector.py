@@ -150,15 +150,15 @@ class HandDetector:
         known: how many hands are followed: the finder sees them, too, so that so many more places
             are returned.
         """
+        image, wide_k = wide(depth_m, k)
 
         @torch.inference_mode()
-        def look() -> tuple[Found, np.ndarray]:
-            image, wide_k = wide(depth_m, k)
-            return Found(*on_host(*self.finder(on_device(image, self.finder.device)))), wide_k
+        def look() -> Found:
+            return Found(*on_host(*self.finder(on_device(image, self.finder.device))))
 
         wait = beside(look) if isinstance(self.finder, OnnxFinder) else look
         most, least = self.settings.places + known, self.settings.least
-        return lambda: likely_places(*wait(), most, least)
+        return lambda: likely_places(wait(), wide_k, most, least)
 
 
 def make_detector(weights: str | None = None, **settings: Any) -> HandDetector:

@@ -19,7 +19,7 @@ import torch
 from numpy import empty, zeros
 from torch import Tensor
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, entry_point, shared_entry_point
 from toftrack.compute.rigid_numba import joints_of, pose_hand, product, quaternion, rotation_vector
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import ANGLE_LIMITS, HandPose
@@ -374,7 +374,7 @@ def _move(state, prior, settings, sums):
         state[6 + j] = min(max(bent, _LIMITS[j, 0]), _LIMITS[j, 1])
 
 
-@entry_point
+@shared_entry_point
 def refine_hands(states, priors, keypoints, seen, shape, surface, settings):
     """Refine hands, one after the other: a few are done before a second thread is awake.
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, shared_entry_point
 from toftrack.compute.rigid_numba import mix_columns
 from toftrack.training.things_numba import part_distance
 
@@ -214,7 +214,7 @@ def _yield(finger, angles, hand):
             angles[angle] = max(angles[angle] - _BACK, min(_LEAST, angles[angle]))
 
 
-@entry_point
+@shared_entry_point
 def grasp(angles, thumbs, opposed, most, tasks, in_palm, flesh, bones, parts, said):
     """N hands on N things.
 

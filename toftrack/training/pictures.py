@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import compiled, shared_entry_point
 from toftrack.detector.crops import CROP, CROP_CHANNELS, CROP_M
 from toftrack.detector.network import PARTS
 from toftrack.training.dice import Dice
@@ -295,7 +295,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
                     depth[v, u] = 0.0
 
 
-@entry_point
+@shared_entry_point
 def _take(ellipsoids, skins, others, cameras, depth, labels):
     """All pictures of a batch, see take_pictures."""
     (centres, axes, whiten, which), (primitives, whose, widths) = ellipsoids, skins
@@ -371,7 +371,7 @@ def read_pictures(
     return torch.from_numpy(image), torch.from_numpy(parts).long()
 
 
-@entry_point
+@shared_entry_point
 def _read(depth, labels, side, distance, turn, border, image, parts):
     shown = np.empty((2 * CROP, 2 * CROP), np.int8)
     for n in range(len(depth)):

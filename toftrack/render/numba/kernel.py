@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point, take
+from toftrack.compute.compiling import compiled, entry_point, shared_entry_point, take
 from toftrack.render.numba.hand import (
     BOTTOM,
     DU,
@@ -343,7 +343,7 @@ def pack_evidence(low, high, occluder, hand):
     return images, bits
 
 
-@entry_point
+@shared_entry_point
 def score_hands(states, frame, shape, counter, out):
     """Score particles as long as `counter` has any; called from several threads.
 
