@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import sys
 import threading
@@ -130,6 +131,21 @@ def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -
     with pytest.raises(ZeroDivisionError), made():
         1 / 0  # noqa: B018
     assert len(stayed) == 2 and ours() == []
+
+
+def test_ctrl_c_ends_a_wait_also_where_the_system_s_own_go_on(monkeypatch) -> None:
+    waits: list[float | None] = []
+
+    def deaf(event: threading.Event, timeout: float | None = None) -> None:
+        waits.append(timeout)
+        if len(waits) == 3:  # as on Windows, between two waits
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Event, "wait", deaf)
+        with pytest.raises(KeyboardInterrupt):
+            browser._stay(math.inf)
+    assert all(seconds is not None and seconds < 1 for seconds in waits)
 
 
 def test_the_page_works_in_a_browser(chromium, view) -> None:

@@ -29,7 +29,7 @@ from toftrack.errors import ToftrackError, check_number
 from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
 from toftrack.evaluation.results import checked_targets
 from toftrack.gestures.recognition import Gestures
-from toftrack.output.web.server import ANY_PORT
+from toftrack.output.web.server import ANY_PORT, wait
 from toftrack.programs import shutdown
 from toftrack.programs.applications import with_recording
 from toftrack.programs.command_line import plain_parser
@@ -81,7 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not options.no_browser:
             webbrowser.open(page.address)
         try:
-            threading.Event().wait()
+            wait(threading.Event())
         except KeyboardInterrupt as end:  # which is how it ends
             if shutdown.exit_status(end) != 128 + signal.SIGINT:
                 raise

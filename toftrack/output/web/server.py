@@ -18,6 +18,7 @@ import math
 import re
 import secrets
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
@@ -66,8 +67,17 @@ _MOST_ORIGINS = 20
 _CLOSING_S = 1.0
 """How long the messages that still wait at the end have to leave."""
 _PAUSE_S = 0.01
+_LOOK_S = 0.25
+"""A wait of the main thread in one piece, which Ctrl-C does not end on Windows."""
 ANY_PORT = " (0 = any free one)"
 """What is said of a port that cannot be meant."""
+
+
+def wait(event: threading.Event, seconds: float = math.inf) -> None:
+    """Wait for an event, so long at most; Ctrl-C ends it everywhere."""
+    end_s = time.monotonic() + seconds
+    while not event.is_set() and (left_s := end_s - time.monotonic()) > 0:
+        event.wait(min(left_s, _LOOK_S))
 
 
 class Client:

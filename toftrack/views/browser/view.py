@@ -40,7 +40,7 @@ from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.estimate import is_vacant, state_words
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import hand_content, strict
-from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of
+from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of, wait
 from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand, View
 from toftrack.views.overlay import caption_px, draw_tracked
 
@@ -113,7 +113,7 @@ class BrowserView(View):
         if frames is not None and wait_s > 0:
             print(f"waiting up to {wait_s:g} s for it to be opened", file=sys.stderr, flush=True)
             try:
-                self._visited.wait(min(wait_s, threading.TIMEOUT_MAX))
+                wait(self._visited, wait_s)
             except BaseException:
                 self.close()
                 raise
@@ -247,7 +247,7 @@ class _Visitor(Client):
 
 
 def _stay(seconds: float) -> None:
-    threading.Event().wait(min(seconds, threading.TIMEOUT_MAX))
+    wait(threading.Event(), seconds)
 
 
 def _encode(tracked: TrackedFrame, quality: int) -> bytes:
