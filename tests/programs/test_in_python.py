@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -218,6 +219,16 @@ def test_what_is_no_frame_is_refused_where_it_is_pushed(depth: Any, time_s: Any)
         camera.push(depth, time_s)
     camera.end()
     assert not list(camera) and camera.dropped == 0
+
+
+def test_times_that_are_now_come_from_a_clock_that_is_fine_everywhere(monkeypatch) -> None:
+    monkeypatch.setattr(time, "monotonic", lambda: 1.0)  # Windows had it tick 64 times a second
+    depth, camera = sample().depth_m[0], toftrack.PushDevice(Sample().camera)
+    tracker = toftrack.make_tracker("experiment=paper", "hand.side=right")
+    first, second = (tracker.step(depth, sample().k).timestamp_s for _ in range(2))
+    camera.push(depth)
+    pushed = next(iter(camera)).timestamp_s
+    assert 1.0 != first < second < pushed < second + 60
 
 
 def test_of_frames_that_are_pushed_the_newest_is_tracked() -> None:

@@ -32,7 +32,7 @@ class PushDevice(BaseDevice):
 
         Raises ToftrackError here, and not where it is tracked, for what is no image of the camera.
         """
-        now = time.monotonic() if timestamp_s is None else timestamp_s
+        now = time.perf_counter() if timestamp_s is None else timestamp_s
         count, time_s = checked_moment(self._count, now)
         image = np.array(depth, copy=True)
         if image.dtype.kind in "iu":

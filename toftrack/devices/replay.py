@@ -103,10 +103,10 @@ class Replay(BaseDevice):
         try:
             while count <= last:
                 if self._realtime and count:
-                    count = self._paced(count, last, time.monotonic() - begin)
+                    count = self._paced(count, last, time.perf_counter() - begin)
                 yield self._frame(count)
                 if not count:  # much is loaded for the first one, which a recording can wait for
-                    begin = time.monotonic()
+                    begin = time.perf_counter()
                 count += 1
         finally:
             self._recording.close()

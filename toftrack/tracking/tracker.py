@@ -80,7 +80,7 @@ class HandsTracker:
         quality = self.time.begin(began_s)
         depth_m, k = checked_image(depth_m, k)
         index = self.state.next_index if index is None else index
-        timestamp_s = time.monotonic() if timestamp_s is None else timestamp_s
+        timestamp_s = time.perf_counter() if timestamp_s is None else timestamp_s
         image = DepthImage(depth_m, k, *checked_moment(index, timestamp_s))
         with at_most(quality.threads):
             model = self.model.at_quality(quality)

@@ -245,7 +245,7 @@ class Reader:
         self._stop = threading.Event()
         self._finished = False
         self._error: Exception | None = None
-        self._epoch_s = time.time() - time.monotonic()
+        self._epoch_s = time.time() - time.perf_counter()
         self._thread = threading.Thread(target=self._run, name="sr3000-reader", daemon=True)
         self._thread.start()
 
@@ -326,7 +326,7 @@ class Reader:
             self.counts.unanswered += 1
 
     def _put(self, data: bytes) -> None:
-        capture = Capture(self.next_index, self._epoch_s + time.monotonic(), data)
+        capture = Capture(self.next_index, self._epoch_s + time.perf_counter(), data)
         self.next_index += 1
         with self._changed:
             self.counts.received += 1

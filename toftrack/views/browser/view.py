@@ -127,7 +127,7 @@ class BrowserView(View):
         if (amplitude := tracked.frame.amplitude) is not None:
             # Drawn later, when the device may have used its memory for the next frame.
             tracked = replace(tracked, frame=replace(tracked.frame, amplitude=np.array(amplitude)))
-        now_s, took_s = time.monotonic(), tracked.hands[0].estimate.compute_s
+        now_s, took_s = time.perf_counter(), tracked.hands[0].estimate.compute_s
         self._times_s.append(now_s)
         self._newest = tracked, now_s - (took_s if math.isfinite(took_s) else 0.0)
         self._phase = "live"
@@ -180,7 +180,7 @@ class BrowserView(View):
         told = {"phase": self._phase, "picture": picture}
         if not picture:
             return told
-        age_ms = round(1e3 * (time.monotonic() - self._arrived_s), 1)
+        age_ms = round(1e3 * (time.perf_counter() - self._arrived_s), 1)
         return told | self._facts | {"age_ms": age_ms}
 
     def wanted(self) -> None:
