@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import pytest
@@ -31,6 +33,20 @@ def test_a_request_ends_what_goes_on(listening, number: int) -> None:
     with pytest.raises(EndedError) as end:
         ask(number)
     assert isinstance(end.value, KeyboardInterrupt) and exit_status(end.value) == 128 + number
+
+
+def test_ctrl_break_of_windows_is_a_request() -> None:
+    program = """
+import os, signal
+signal.SIGBREAK = signal.SIGUSR1
+from toftrack.programs import shutdown
+try:
+    with shutdown.obeyed():
+        os.kill(os.getpid(), signal.SIGBREAK)
+except shutdown.EndedError:
+    print("ended")
+"""
+    assert subprocess.check_output([sys.executable, "-c", program]).split() == [b"ended"]
 
 
 def test_what_must_be_whole_is_finished_first(listening) -> None:

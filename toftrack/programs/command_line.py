@@ -1,7 +1,7 @@
 """What the command-line programs share: clear errors, exit statuses, and sweeps that carry on.
 
 Exit status: 0 done, 1 an error (one sentence on standard error), 130 interrupted, 143 terminated
-(SIGTERM), 129 hung up (SIGHUP).
+(SIGTERM), 129 hung up (SIGHUP), 149 by Ctrl-Break (on Windows).
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""How a program ends when it is asked to: Ctrl-C, SIGTERM, or a terminal that is closed.
+"""How a program ends when it is asked to: Ctrl-C, SIGTERM, or a terminal that is closed; on
+Windows Ctrl-Break.
 
 All of them raise EndedError in the main thread, as Ctrl-C raises KeyboardInterrupt. Only the first
 one does: whoever is finishing files is left alone until somebody has asked once too often.
@@ -16,10 +17,9 @@ from dataclasses import dataclass
 from types import FrameType
 from typing import Any, TextIO
 
-SHUTDOWN_SIGNALS = tuple(
-    getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)
-)
-"""The signals that ask a program to end; Windows has no SIGHUP."""
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+SHUTDOWN_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+"""The signals that ask a program to end; Windows has no SIGHUP, and alone has SIGBREAK."""
 _PATIENCE = 2
 """So many further requests are let pass while files are finished."""
 _HINT = b"\nfinishing the files; once more ends at once\n"
