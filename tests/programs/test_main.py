@@ -131,10 +131,13 @@ def test_an_option_that_there_is_not_is_one_sentence(words: str, capsys) -> None
     assert said.startswith("error: ") and said.count("\n") == 1 and "--help" in said
 
 
-def test_a_folder_s_name_may_be_of_any_script() -> None:
-    (override,) = options_first(["hydra.run.dir=手 يد/it"])
+@pytest.mark.parametrize(
+    "name", ["手 يد/it", r"C:\new\run", r"C:\Users\MAXMUS~1\run", r"\\machine\runs", "C:\\runs\\"]
+)
+def test_a_folder_s_name_may_be_of_any_script_and_of_windows(name: str) -> None:
+    (override,) = options_first([f"hydra.run.dir={name}"])
     read = OverridesParser.create().parse_override(override)
-    assert (read.key_or_group, read.value()) == ("hydra.run.dir", "手 يد/it")
+    assert (read.key_or_group, read.value()) == ("hydra.run.dir", name)
 
 
 @pytest.mark.parametrize("words", ["--version", "track seed=1 --version"])

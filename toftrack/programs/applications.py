@@ -182,9 +182,12 @@ def _check_option(word: str) -> None:
 
 
 def _readable(override: str) -> str:
-    """Of letters outside of quotes Hydra reads those of ASCII alone, as in a folder's name."""
+    """Outside of quotes Hydra reads letters of ASCII alone, as in a folder's name, and no ~ of a
+    short name of Windows; of the two signs that begin the name of another machine it reads one.
+    """
     key, _, value = override.partition("=")
-    if value.isascii() or set(value) & set("""'"[]{}(),$"""):
+    plain = value.isascii() and "~" not in value[1:] and not value.startswith("\\\\")
+    if plain or set(value) & set("""'"[]{}(),$"""):
         return override
     return f"{key}={quoted(value)}"
 

@@ -381,7 +381,7 @@ def _refused(group: str, host: str, port: int, error: OSError) -> ToftrackError:
         )
     if error.errno == errno.EACCES:
         return ToftrackError(
-            f"port {port} of {host} may not be used; choose one above 1023 with {set_port}PORT"
+            f"port {port} of {host} may not be used; choose another above 1023 with {set_port}PORT"
             f"{ANY_PORT}"
         )
     return ToftrackError(
