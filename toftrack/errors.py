@@ -65,7 +65,7 @@ def module_of_extra(name: str, what: str, extra: str) -> ModuleType:
         return importlib.import_module(name)
     except ImportError:
         raise ToftrackError(
-            f"{what}, which is not installed: pip install 'toftrack[{extra}]'"
+            f'{what}, which is not installed: pip install "toftrack[{extra}]"'
         ) from None
 
 

@@ -212,7 +212,7 @@ def test_on_another_device_torch_runs_them() -> None:
 
 def test_without_what_an_export_needs_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_export.importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(ToftrackError, match=r"onnx and onnxscript: pip install 'toftrack\[train\]"):
+    with pytest.raises(ToftrackError, match=r"onnx and onnxscript: pip install .toftrack\[train\]"):
         main(["export", str(DEFAULT_FILE)])
 
 

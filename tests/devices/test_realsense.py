@@ -216,7 +216,7 @@ def test_a_missing_or_old_sdk_is_reported_with_the_extra(
     (tmp_path / "a.bag").write_bytes(b"#ROSBAG V2.0\n")
     for module in (None, ModuleType("pyrealsense2")):
         monkeypatch.setitem(sys.modules, "pyrealsense2", module)
-        with pytest.raises(ToftrackError, match=r"pyrealsense2.*pip install 'toftrack\[rea"):
+        with pytest.raises(ToftrackError, match=r"pyrealsense2.*pip install .toftrack\[rea"):
             realsense()
         with pytest.raises(ToftrackError, match="ROS topics goes without: toftrack track FILE"):
             realsense(bag=tmp_path / "a.bag")

@@ -321,7 +321,7 @@ def test_a_missing_matplotlib_is_one_sentence_and_leaves_out_plots_alone(
     run: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
-    with pytest.raises(ToftrackError, match=r"pip install 'toftrack\[figures\]'"):
+    with pytest.raises(ToftrackError, match=r'pip install "toftrack\[figures\]"'):
         draw_figures(run)
     drawn = [
         ("plot.png", lambda: chart.picture_of(chart.new_figure(90, 90))),

@@ -175,7 +175,7 @@ def test_bags_without_depth_are_reported(
 def test_a_missing_extra_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "rosbags.rosbag1", None)
     (tmp_path / "a.bag").write_bytes(b"")
-    with pytest.raises(ToftrackError, match=r"rosbags.*pip install 'toftrack\[ros\]'"):
+    with pytest.raises(ToftrackError, match=r'rosbags.*pip install "toftrack\[ros\]"'):
         Replay(tmp_path / "a.bag")
 
 

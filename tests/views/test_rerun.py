@@ -40,7 +40,7 @@ def test_without_rerun_a_sentence_names_the_extra(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Exception) as error:
         instantiate(configuration("view=rerun").view, _partial_=True)
     assert "needs the package rerun-sdk" in sentence(error.value)
-    assert "'toftrack[rerun]'" in sentence(error.value)
+    assert '"toftrack[rerun]"' in sentence(error.value)
 
 
 @pytest.fixture(scope="module")

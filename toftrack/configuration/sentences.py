@@ -169,17 +169,17 @@ def _of_syntax(error: OverrideParseException) -> str:
     if not separator:
         return f"{text}; settings are given as KEY=VALUE, as in hand.side=left"
     if key == "device.path":
-        return f"{text}; give the recording by its name alone: toftrack track '{value}'"
+        return f'{text}; give the recording by its name alone: toftrack track "{value}"'
     return (
         f"{text}; where a value has blanks, commas, brackets or other signs, put it in two pairs of"
-        f""" quotes: '{key}="..."'"""
+        f""" quotes: "{key}='...'\""""
     )
 
 
 def _of_several(override: str) -> str:
     key, _, value = override.partition("=")
     may_be_list = "(" not in value and not (configuration_folder() / key).is_dir()
-    hint = f", or a list, '{key}=[{value}]'" if may_be_list else ""
+    hint = f', or a list, "{key}=[{value}]"' if may_be_list else ""
     return f"{override} has several values; give one{hint} (toftrack track -m takes each in turn)"
 
 
@@ -190,7 +190,7 @@ def _of_choice(missing: str, options: Sequence[str]) -> str | None:
     shortened = re.compile(".*".join(map(re.escape, word))).match  # kpca, of kernel_pca
     likely = next(filter(shortened, options), None) or _nearest(_MEANT.get(word, word), options)
     hint = f"did you mean {group}={likely}? The choices are" if likely else "give one of"
-    extra = f" (or pip install 'toftrack[{word}]')" if word in _HYDRAS else ""
+    extra = f' (or pip install "toftrack[{word}]")' if word in _HYDRAS else ""
     return f"there is no {group}={word}{extra}; {hint} {', '.join(options)}"
 
 

@@ -169,7 +169,7 @@ class _Bag:
             types = importlib.import_module("rosbags.typesys")
         except ImportError as error:
             raise ToftrackError(
-                f"'{path}' is read by rosbags ({error}): pip install 'toftrack[ros]' (or, if a "
+                f"'{path}' is read by rosbags ({error}): pip install \"toftrack[ros]\" (or, if a "
                 "camera's own program wrote it, device=realsense or orbbec with device.bag=FILE)"
             ) from error
         # The messages that are read are the same in every release of ROS 2.

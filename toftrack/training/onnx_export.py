@@ -158,7 +158,7 @@ def missing_packages() -> list[str]:
 
 def needed(missing: list[str]) -> str:
     """How to get what is missing."""
-    return f"ONNX files need {' and '.join(missing)}: pip install 'toftrack[train]'"
+    return f'ONNX files need {" and ".join(missing)}: pip install "toftrack[train]"'
 
 
 def export_networks(weights: Path, whole_numbers: bool = True) -> list[Path]:

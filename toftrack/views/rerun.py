@@ -48,7 +48,7 @@ from toftrack.views.video import writing
 
 with reported_errors(
     "view=rerun needs the package rerun-sdk",
-    "install it with pip install 'toftrack[rerun]', or choose another view",
+    'install it with pip install "toftrack[rerun]", or choose another view',
     ImportError,
 ):
     import rerun as rr

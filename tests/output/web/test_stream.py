@@ -157,10 +157,10 @@ def test_a_host_that_can_be_no_name_is_one_sentence_and_leaves_no_thread() -> No
 @pytest.mark.parametrize(
     "headers, words",
     [
-        ({"Origin": "http://evil.example"}, "'stream.origins=[http://evil.example]'"),
+        ({"Origin": "http://evil.example"}, '"stream.origins=[http://evil.example]"'),
         ({"Origin": "null"}, "a page of no address"),
         ({"Origin": "http://a]';reboot"}, "a page of no address"),
-        ({"Origin": "https://127.0.0.1"}, "'stream.origins=[https://127.0.0.1]'"),
+        ({"Origin": "https://127.0.0.1"}, '"stream.origins=[https://127.0.0.1]"'),
         ({"Host": "127.0.0.1.evil.example"}, "localhost only"),
     ],
 )

@@ -199,7 +199,7 @@ def load_sdk() -> ModuleType:
             raise ImportError(f"the installed one has no {missing[0]}")
     except ImportError as error:
         raise ToftrackError(
-            f"device=orbbec needs pyorbbecsdk2 ({error}): pip install 'toftrack[orbbec]', or, for "
+            f'device=orbbec needs pyorbbecsdk2 ({error}): pip install "toftrack[orbbec]", or, for '
             "the newest one, whose requirements clash with others, pip install --no-deps "
             "pyorbbecsdk2"
         ) from error

@@ -204,10 +204,10 @@ def load_sdk(otherwise: str = "") -> ModuleType:
                 return _imported()
             raise ToftrackError(
                 "pyrealsense2 needs libusb-1.0, which is not installed: pip install "
-                "'toftrack[realsense]' brings one, as does apt install libusb-1.0-0"
+                '"toftrack[realsense]" brings one, as does apt install libusb-1.0-0'
             ) from error
         raise ToftrackError(
-            f"device=realsense needs pyrealsense2 ({error}): pip install 'toftrack[realsense]'"
+            f'device=realsense needs pyrealsense2 ({error}): pip install "toftrack[realsense]"'
             f"{otherwise}"
         ) from error
 

@@ -301,7 +301,7 @@ class WebServer:
             remedy = "serve it from one, as a page that is opened as a file has no origin"
         else:
             given = ",".join((*self._origins, origin))
-            remedy = f"if it is yours, give '{self._group}.origins=[{given}]'"
+            remedy = f'if it is yours, give "{self._group}.origins=[{given}]"'
         words = f"a page of {origin} may not listen: {remedy}"
         if origin not in self._refused and len(self._refused) < _MOST_ORIGINS:
             self._refused.add(origin)
