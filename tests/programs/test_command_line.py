@@ -302,3 +302,11 @@ def test_a_cause_deep_inside_is_what_is_reported() -> None:
             raise TypeError("wrapped again") from error
     except TypeError as error:
         assert sentence(error) == "the cause"
+
+
+@pytest.mark.parametrize(("system", "quote"), [("posix", "'"), ("nt", '"')])
+def test_a_command_is_quoted_as_the_system_s_shells_read_it(system, quote, monkeypatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(command_line.os, "name", system)
+        said = command_line.typed(["toftrack", "track", r"C:\a b\x.npz"])
+    assert said == rf"toftrack track {quote}C:\a b\x.npz{quote}"

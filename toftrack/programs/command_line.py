@@ -13,9 +13,11 @@ import json
 import logging
 import math
 import os
+import shlex
+import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -110,6 +112,11 @@ def plain_parser(program: str, about: str | None) -> argparse.ArgumentParser:
     """A parser whose help shows a text, of several lines, as it stands."""
     kind = argparse.RawDescriptionHelpFormatter
     return Parser(prog=program, description=about, formatter_class=kind)
+
+
+def typed(words: Sequence[str]) -> str:
+    """A command as it is typed: the shells of Windows know other quotes."""
+    return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
 class Parser(argparse.ArgumentParser):

@@ -11,7 +11,6 @@ which the tracker is least sure: these tell where it errs, not how often.
 from __future__ import annotations
 
 import argparse
-import shlex
 import signal
 import sys
 import threading
@@ -32,7 +31,7 @@ from toftrack.gestures.recognition import Gestures
 from toftrack.output.web.server import ANY_PORT, wait
 from toftrack.programs import shutdown
 from toftrack.programs.applications import with_recording
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import plain_parser, typed
 from toftrack.views.labelling.page import LabelPage
 
 _FRAMES = 20
@@ -134,7 +133,7 @@ def ending(labels: LabelFile, path: Path, words: Sequence[str]) -> str:
     if options or path.suffix.lower() != ".npz":
         measured = Path(f"{path.stem or path.name}_to_measure.npz")
         command = ["toftrack", "convert", str(path), str(measured), *options]
-        lines.append(f"make an .npz of it: {shlex.join(command)}")
+        lines.append(f"make an .npz of it: {typed(command)}")
     command = ["toftrack", "benchmark", "accuracy", str(measured), "--labels", str(labels.path)]
-    lines.append(f"measure the tracker: {shlex.join(command)}")
+    lines.append(f"measure the tracker: {typed(command)}")
     return "\n".join(lines)

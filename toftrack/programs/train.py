@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from toftrack.files.safe_files import write_whole
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
-from toftrack.programs.command_line import in_sweep, job_words
+from toftrack.programs.command_line import in_sweep, job_words, typed
 from toftrack.views.figures.chart import write_figures
 from toftrack.views.figures.poses import (
     corners_figure,
@@ -100,7 +99,7 @@ def _command(model: Path) -> str:
     words = ["toftrack", "track", *(word for path in own for word in ("--config-dir", path))]
     words.append(f"pose_space={hydra.runtime.choices['pose_space']}")
     words += [word for word in hydra.overrides.task if word.startswith("pose_space.dims")]
-    return shlex.join([*words, f"pose_space.file={model}"])
+    return typed([*words, f"pose_space.file={model}"])
 
 
 def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any]) -> list[Row]:
