@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
@@ -137,6 +138,29 @@ def test_a_datagram_is_a_whole_line(receiver: socket.socket) -> None:
         for i in range(3):
             stream.send(((one := hand_estimate(i)),))
             assert receiver.recv(65535).decode() == json_line((one,)) + "\n"
+
+
+def test_a_line_fits_into_a_datagram_also_where_few_are_so_long(receiver, monkeypatch) -> None:
+    class OfMacOS(socket.socket):
+        room = 9216
+
+        def getsockopt(self, *_: int) -> int:
+            return self.room
+
+        def setsockopt(self, level: int, option: int, value: int) -> None:
+            self.room = value
+
+        def sendto(self, data: bytes, address: tuple) -> int:
+            if len(data) > self.room:
+                raise OSError(errno.EMSGSIZE, "Message too long")
+            return super().sendto(data, address)
+
+    estimate = hand_estimate(3)
+    assert len(json_line((estimate,) * 2)) > OfMacOS.room
+    monkeypatch.setattr(socket, "socket", OfMacOS)
+    with udp_stream("127.0.0.1", receiver.getsockname()[1]) as stream:
+        stream.send((estimate,) * 2)
+    assert stream.sent == 1 and len(json.loads(receiver.recv(65535))["hands"]) == 2
 
 
 def test_a_name_of_two_addresses_is_that_of_ipv4(

@@ -25,6 +25,8 @@ from toftrack.output.lines import LINE_FIELDS, json_line
 _log = logging.getLogger(__name__)
 
 _STDOUT, _STDERR = 1, 2
+_DATAGRAM = 2**16
+"""Bytes of the longest one."""
 _GRACE_S, _PAUSE_S = 1.0, 0.01
 """How long the lines that still wait at the end have to leave; between attempts."""
 
@@ -166,6 +168,9 @@ class UdpStream(Stream):
     def __enter__(self) -> Self:
         self._socket = socket.socket(*self._kind)
         self._socket.setblocking(False)
+        room = socket.SOL_SOCKET, socket.SO_SNDBUF
+        if self._socket.getsockopt(*room) < _DATAGRAM:  # as of macOS, which sends no longer ones
+            self._socket.setsockopt(*room, _DATAGRAM)
         return self
 
     def send(self, estimates: Sequence[Estimate]) -> None:
