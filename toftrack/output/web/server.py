@@ -157,7 +157,8 @@ class WebServer:
         self._half_open: dict[_Connection, None] = {}
         """The oldest first."""
         self._reported_s = -math.inf
-        self._loop = asyncio.new_event_loop()
+        # On Windows, too, whose own loop bounds no read, and may never count out who broke off.
+        self._loop = asyncio.SelectorEventLoop()
         self._loop.set_exception_handler(self._trouble)
         self._thread = threading.Thread(
             target=self._loop.run_forever, name="web-server", daemon=True
