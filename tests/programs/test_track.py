@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -247,6 +248,16 @@ def test_a_folder_that_is_used_again_lists_what_this_run_wrote(here, tmp_path) -
     assert "overlay.mp4" not in out and "hand.csv" not in out
     assert (tmp_path / "out" / "hand.csv").exists()
     assert "earlier run" in (tmp_path / "out" / "track.log").read_text()  # which goes on
+
+
+def test_the_log_has_names_that_the_system_s_encoding_lacks(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(io, "text_encoding", lambda given, _=2: given or "cp1252")  # on Windows
+    with ResultWriter(tmp_path / "手", {}, JOINT_NAMES):
+        pass
+    given = ("device.stop=2", "view=none", *QUICK, "hydra.run.dir=手")
+    _, _, err = programs.call(*given, folder=tmp_path)
+    assert "Logging error" not in err
+    assert "手" in (tmp_path / "手" / "track.log").read_text("utf-8")
 
 
 def test_what_was_written_before_an_error_is_kept(here, tmp_path) -> None:
