@@ -267,8 +267,9 @@ def test_an_exr_that_is_damaged_is_read_or_told(tmp_path: Path) -> None:
 def test_an_archive_is_converted_with_its_camera_and_times(tmp_path: Path) -> None:
     files = {f"take/depth/{n}.png": png(n) for n in range(3)} | {"take/rgb/1.png": COLOUR}
     ImageFolder(laid_out(tmp_path, files, True), GIVEN).camera.save(tmp_path / "c.json")
-    files |= {"take/camera.json": (tmp_path / "c.json").read_bytes()}
-    files |= {"take/depth/timestamps.txt": b"1 1.5 2"}
+    mark = b"\xef\xbb\xbf"  # as editors of Windows write it
+    files |= {"take/camera.json": mark + (tmp_path / "c.json").read_bytes()}
+    files |= {"take/depth/timestamps.txt": mark + b"1 1.5 2"}
     convert.main([str(laid_out(tmp_path, files, True)), str(tmp_path / "out.npz")])
     with make_device("device=replay", f"device.path='{tmp_path}/out.npz'") as device:
         assert [frame.timestamp_s for frame in device] == [1, 1.5, 2]

@@ -25,12 +25,12 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """The content of a file (UTF-8); OSError, or ValueError as parse_json."""
+    """The content of a file (UTF-8, which Windows marks); OSError, or ValueError as parse_json."""
     with open_to_read(path) as stream:
         text = stream.read(MOST_BYTES + 1)
     if len(text) > MOST_BYTES:
         raise ValueError(f"it is larger than {MOST_BYTES // 2**20} MB")
-    return parse_json(text.decode("utf-8"))
+    return parse_json(text.decode("utf-8-sig"))
 
 
 def read_object(path: str | Path) -> dict[str, Any]:

@@ -78,7 +78,7 @@ class Files:
 
     def text(self, name: str) -> str:
         """The content of a text; ToftrackError, or ValueError where it is none."""
-        return self.read(name, MOST_TEXT_BYTES).decode("utf-8")
+        return self.read(name, MOST_TEXT_BYTES).decode("utf-8-sig")
 
     def reported(self, what: str = "") -> AbstractContextManager[None]:
         what = f"{what or self.what} cannot be read"
