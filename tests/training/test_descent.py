@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
@@ -249,3 +250,11 @@ def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
     interrupted(train_finder, late, monkeypatch, after=3)
     with pytest.raises(ToftrackError, match="finder.images can no longer change from 24 to 48"):
         train_finder(more_images, 6, 0, replace(resumed, resume=late.folder))
+
+
+def test_a_system_without_glibc_keeps_its_memory_as_it_does(monkeypatch) -> None:
+    def of_windows(name: None) -> None:
+        "/" in name  # noqa: B015
+
+    monkeypatch.setattr(ctypes, "CDLL", of_windows)
+    batches.keep_memory()

@@ -38,7 +38,7 @@ def keep_memory() -> None:
     """Ask glibc to reuse what was freed: the batches' large arrays come and go all the time, and
     fresh pages cost more than half of the time on some machines. Elsewhere nothing happens.
     """
-    with contextlib.suppress(OSError, AttributeError):
+    with contextlib.suppress(OSError, AttributeError, TypeError):  # the last is Windows's
         libc = ctypes.CDLL(None)
         for option in (_M_MMAP_THRESHOLD, _M_TRIM_THRESHOLD):
             libc.mallopt(option, 1 << 30)
