@@ -30,12 +30,6 @@ def test_what_cannot_be_meant_is_an_error(text: str, words: str, tmp_path: Path)
             load(tmp_path / "hostile.json")
 
 
-def test_usual_content_is_read(tmp_path: Path) -> None:
-    path = tmp_path / "usual.json"
-    path.write_text('{"é": [1, -2.5e3, true, null, 123456789012345678]}', encoding="utf-8")
-    assert read_json(path) == {"é": [1, -2500.0, True, None, 123456789012345678]}
-
-
 def test_the_mark_that_editors_of_windows_write_is_none_of_the_content(tmp_path: Path) -> None:
     (tmp_path / "a.json").write_text('{"a": 1}', "utf-8-sig")
     assert read_json(tmp_path / "a.json") == {"a": 1}
