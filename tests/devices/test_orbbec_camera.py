@@ -176,5 +176,5 @@ def test_a_missing_or_strange_sdk_is_reported_with_the_extra(
 ) -> None:
     for module in (None, ModuleType("pyorbbecsdk")):
         monkeypatch.setitem(sys.modules, "pyorbbecsdk", module)
-        with pytest.raises(ToftrackError, match=r"pyorbbecsdk2.*'toftrack\[orbbec\]'.*--no-deps"):
+        with pytest.raises(ToftrackError, match=r'pyorbbecsdk2.*"toftrack\[orbbec\]".*--no-deps'):
             orbbec()
