@@ -120,7 +120,8 @@ def test_a_folder_with_missing_numbers_is_doubted_until_it_has_times(tmp_path: P
 def test_a_folder_in_another_unit_is_reported(tmp_path: Path) -> None:
     with make_device("device=sample", "device.stop=1") as sample:
         depth = next(iter(sample)).depth
-    for step_m, right in ((0.01, "0.01 m a step"), (0.0001, "0.0001 m a step")):
+    tenths = "0.0001 m a step instead of 0.001, or 0.000125 of an SR300 or SR305"
+    for step_m, right in ((0.01, "0.01 m a step"), (0.0001, tenths), (0.000125, tenths)):
         cv2.imwrite(str(tmp_path / "0.png"), (depth / step_m).astype(np.uint16))
         given = {"intrinsics": [200, 200, 88, 72]}
         (doubt,) = Replay(tmp_path, **given).description["doubts"]

@@ -24,6 +24,8 @@ _NEAREST_M = (0.15, 1.5)
 """Between these lies what is nearest in an image of a hand."""
 _STEP_S, _FASTEST_S = (0.005, 5.0), 0.0005
 """Between frames of a hand that is to be followed; of the fastest camera."""
+_EIGHTH_M = 0.000125
+"""A step of two cameras, nearer to a tenth of a millimetre than to one: named beside the tenth."""
 _TIME_UNITS = (
     ("milliseconds", 1e3),
     ("microseconds", 1e6),
@@ -87,8 +89,11 @@ def _unit_doubt(depth_m: np.ndarray, unit_m: float | None) -> str:
         if _NEAREST_M[0] <= nearest * 10.0**power <= _NEAREST_M[1]:
             right = f"{10.0**power:g} times the distances would fit"
             if unit_m is not None:
+                step = unit_m * 10.0**power
+                near = 0.5 * _EIGHTH_M < step < _EIGHTH_M
+                eighth = f", or {_EIGHTH_M:g} of an SR300 or SR305" if near else ""
                 right += (
-                    f", {unit_m * 10.0**power:.3g} m a step instead of {unit_m:g} (device.unit_m, "
+                    f", {step:.3g} m a step instead of {unit_m:g}{eighth} (device.unit_m, "
                     "depth_unit_m in camera.json, or convert --source-unit)"
                 )
             return f"{where}; {right}"
