@@ -3,7 +3,7 @@
 
     python tests/data/real/make_extract.py RECORDING GIT_DIR OUT.npz
 
-RECORDING: one of README.md. Needs git, numpy and opencv, r200_ceiling also scipy.
+RECORDING: one of README.md. Needs git, numpy and opencv, hololens and r200_ceiling also scipy.
 """
 
 import io
@@ -166,6 +166,55 @@ def r200_ceiling():
     save(depth, intrinsics(615.0, 615.0, 319.5, 239.5), joints_uv=joints, labels=labels)
 
 
+def bighand():
+    """A single image of the BigHand2.2M set: an Intel RealSense SR300, 16 bit, millimetres, 640 x
+    480; K is the repository's (data/hands17/holder.py).
+    """
+    depth = images("code_local/test/image_D00000030.png")[0] / 1000
+    save([depth], intrinsics(475.066, 475.066, 315.945, 245.287))
+
+
+def hololens():
+    """A single image of the head: the near Time-of-Flight camera of a Microsoft HoloLens, 448 x
+    450, whole millimetres along the ray, 4095 = no reading. The repository has the camera's table
+    of the ray of each pixel, column by column (x to the left); a pinhole image of the resolution
+    in the table's middle is made of it.
+    """
+    from scipy.interpolate import griddata
+
+    file, table = show("sampleImage.pgm", "short_throw_depth_camera_space_projection.bin")
+    image = cv2.imdecode(np.frombuffer(file, np.uint8), -1)
+    x, y = np.frombuffer(table, np.float32).reshape(448, 450, 2).T.astype(float) * [[[-1]], [[1]]]
+    known = np.isfinite(x)
+    metres = np.where(image < 1000, image / 1000 / np.sqrt(x**2 + y**2 + 1), 0)
+    v, u = np.mgrid[:450, :448]
+    at = (u - 223.5) / 192, (v - 224.5) / 192
+    depth = griddata((x[known], y[known]), metres[known], at, "nearest")
+    save([np.where(np.hypot(*at) < 1.5, depth, 0)], intrinsics(192.0, 192.0, 223.5, 224.5))
+
+
+def nyu():
+    """The first test image of the NYU set: a PrimeSense camera (as a Kinect v1), millimetres in
+    green (upper eight bits) and blue, 640 x 480; K is the set's. As published it is mirrored (the
+    colour image shows a shirt's writing), which is undone: a left hand.
+    """
+    (image,) = images("depth_1_0000001.png")
+    metres = (256.0 * image[:, ::-1, 1] + image[:, ::-1, 0]) / 1000
+    save([np.where(metres < 2, metres, 0)], intrinsics(588.04, 587.08, 639 - 320.0, 240.0))
+
+
+def sr305():
+    """Two sequences in part, of one person at 0.6 m: an Intel RealSense SR305, 640 x 480, 16 bit,
+    steps of 0.125 mm; unit and K are the repository's (datasets/custom/readme.txt). labels: the
+    first shows an open hand that turns, the second hands with some fingers bent.
+    """
+    paths = [f"20210326-230536/{n}.png" for n in range(30, 171, 20)]
+    paths += [f"20210326-231615/{n}.png" for n in range(0, 221, 20) if n != 120]
+    depth = np.stack(images(*(f"datasets/custom/{path}" for path in paths))) * 0.000125
+    labels = np.array(["palm"] * 8 + ["other"] * 11)
+    save(depth, intrinsics(476.007, 476.007, 313.683, 242.755), labels=labels)
+
+
 def room(pattern, K, fps=1.0, commit="HEAD"):
     """Depth images without any hand, 16 bit, millimetres, 65535 = no reading, in the order of the
     numbers in their names. pattern: of their paths.
@@ -246,7 +295,8 @@ CAMCUBE = {
         " pointing palm four three_no_thumb victory pointing fist",
     ),
 }
-MAKERS = {made.__name__: made for made in (adi_tof, fpha, hamer_depth, kinect1_room, r200_ceiling)}
+made = (adi_tof, bighand, fpha, hamer_depth, hololens, kinect1_room, nyu, r200_ceiling, sr305)
+MAKERS = {one.__name__: one for one in made}
 MAKERS |= {f"cvar_p{n}": lambda n=n: cvar(f"P{n}") for n in (1, 3, 4, 5, 6, 7)}
 MAKERS |= {
     f"camcube_{name}": lambda given=given: camcube(*given) for name, given in CAMCUBE.items()
