@@ -19,6 +19,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings import recorder as module
+from toftrack.recordings.doubts import times_doubt
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.recorder import Recorder
 from toftrack.recordings.unfinished import recover_recording
@@ -260,6 +261,14 @@ def test_times_never_go_back_nor_leap(tmp_path: Path) -> None:
     expected = [5.0, 5.1, 5.1 + step, 5.2 + step, 5.2 + 2 * step, 5.4 + step]
     expected += [5.4 + 2 * step, 45.4 + 2 * step]
     np.testing.assert_allclose(read_recording(tmp_path / "hand.npz").timestamp_s, expected)
+
+
+def test_times_in_another_unit_stay_as_they_are_to_be_told(tmp_path: Path) -> None:
+    times = 5e6 + 33_333.0 * np.arange(5)  # microseconds: each step would be a leap
+    recorded(tmp_path / "hand.npz", *(one_frame(timestamp_s=time) for time in times))
+    found = read_recording(tmp_path / "hand.npz").timestamp_s
+    np.testing.assert_allclose(np.diff(found)[1:], 33_333.0)
+    assert "microseconds" in times_doubt(found)
 
 
 def test_another_unit_is_reported_at_the_beginning(tmp_path: Path) -> None:

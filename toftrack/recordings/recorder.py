@@ -241,17 +241,19 @@ class Recorder:
 
 class _Clock:
     """Times that neither go back nor leap: where a camera counts anew, they go on a frame after the
-    one before."""
+    one before. Leaps one after the other are times in another unit, which stay as they are: who
+    reads them is told which it is."""
 
     def __init__(self) -> None:
-        self._offset_s, self._latest_s = 0.0, -math.inf
+        self._offset_s, self._latest_s, self._leapt = 0.0, -math.inf, False
 
     def at(self, time_s: float, fps: float) -> float:
         """The time of the next frame."""
         shifted_s = time_s + self._offset_s
         begun = math.isfinite(self._latest_s)
-        most_s = self._latest_s + LEAP_S if begun else math.inf
-        if not math.isfinite(shifted_s) or not self._latest_s <= shifted_s < most_s:
+        leapt_before, self._leapt = self._leapt, begun and shifted_s - self._latest_s >= LEAP_S
+        wrong = shifted_s < self._latest_s or (self._leapt and not leapt_before)
+        if wrong or not math.isfinite(shifted_s):
             before_s = self._latest_s if begun else 0.0
             shifted_s = before_s + 1 / fps
             if math.isfinite(time_s):
