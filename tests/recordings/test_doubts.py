@@ -38,6 +38,10 @@ def test_times_in_another_unit_are_reported_with_the_factor(factor: float, words
     assert words in times_doubt(TIMES * factor + 17)
 
 
+def test_slow_milliseconds_are_reported_although_they_are_nearer_to_fast_microseconds() -> None:
+    assert "divide them by 1000," in times_doubt(1800.0 * np.arange(5))
+
+
 def test_times_that_stand_still_are_reported() -> None:
     assert "4 of 5 time stamps repeat" in times_doubt(np.full(5, 3.0))
     assert "57 of 60" in times_doubt(np.floor(np.arange(60) / 25)), "whole seconds"

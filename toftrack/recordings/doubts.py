@@ -34,7 +34,8 @@ _TIME_UNITS = (
     ("nanoseconds", 1e9),
     ("thousands of seconds", 1e-3),
 )
-"""Names of units and how many of them a second has: that is meant which is nearest to this rate."""
+"""Names of units and how many of them a second has. Of several that fit, that one is meant with
+which the rate is nearest to the usual one."""
 _USUAL_FPS = 30.0
 _LONG_STEP = 1.5
 """Times the usual step between frames, beyond which some are missing."""
@@ -115,9 +116,10 @@ def times_doubt(timestamp_s: np.ndarray) -> str:
     step = float(np.median(steps[steps > 0]))
     if _FASTEST_S <= step < _STEP_S[1]:
         return ""
-    unit, in_a_second = min(_TIME_UNITS, key=lambda one: abs(np.log(step / one[1] * _USUAL_FPS)))
-    if not _STEP_S[0] <= step / in_a_second < _STEP_S[1]:
+    fitting = [unit for unit in _TIME_UNITS if _STEP_S[0] <= step / unit[1] < _STEP_S[1]]
+    if not fitting:
         return ""
+    unit, in_a_second = min(fitting, key=lambda unit: abs(np.log(step / unit[1] * _USUAL_FPS)))
     right = f"divide them by {in_a_second:.0f}"
     if in_a_second < 1:
         right = f"multiply them by {1 / in_a_second:.0f}"
