@@ -5,22 +5,26 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from helpers import programs
 from helpers.programs import QUICK
 from helpers.tracking import ROOT
 from hydra.errors import HydraException
 from hydra.utils import instantiate
 
+import toftrack
 from toftrack.configuration.sentences import sentence
 from toftrack.devices.base import BaseDevice
 from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
+from toftrack.frames.frame import Frame
 
 FRAMES = 12
 
@@ -75,6 +79,22 @@ def test_the_readmes_camera_is_tracked(workplace: Path, track: Callable) -> None
     # The sample's centre is not that of the image; the depth does not care.
     assert found.shape == (FRAMES, 21, 3)
     assert np.abs(found[..., 2] - sample.truth.joints_m[..., 2]).mean() < 0.01
+
+
+class Tensors(Sample):
+    """A camera whose images are tensors."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        for frame in super().__iter__():
+            yield replace(frame, depth=torch.from_numpy(frame.depth))
+
+
+def test_a_camera_may_give_tensors() -> None:
+    found, expected = (
+        [estimate.joints_m for estimate in toftrack.track(device(stop=2), *QUICK, "view=none")]
+        for device in (Tensors, Sample)
+    )
+    np.testing.assert_array_equal(found, expected)
 
 
 def test_its_own_error_is_reported_in_one_sentence(workplace: Path) -> None:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any, Self
 
-import numpy as np
-
 from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame, Truth
@@ -64,7 +62,7 @@ def frames_of(device: BaseDevice) -> Iterator[Frame]:
     """Its frames; ToftrackError for anything else, which one of somebody's own may yield."""
     for frame in device:
         wrong = "" if isinstance(frame, Frame) else type(frame).__name__
-        if not wrong and not isinstance(frame.depth, np.ndarray):
+        if not wrong and not hasattr(frame.depth, "shape"):  # a tensor is as good as an array
             wrong = f"one with a depth of {type(frame.depth).__name__}"
         if wrong:
             code: Any = getattr(type(device).__iter__, "__code__", None)
