@@ -52,6 +52,7 @@ def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
         [0, 0.04, 0.08, 0.12, 1.7e9, 1.7e9 + 0.04],  # the clock was set
         [4294.9, 4294.94, 0.01, 0.05, 0.09, 0.13],  # 32 bits of microseconds
         [0, 0, 0.08, 0.08, 0.16, 0.16, 0.24],  # one stamp for two frames
+        [0, 0.04, 0.08, 60.0, 60.04, 0.01, 0.05],  # plugged in again after a minute
     ],
 )
 def test_a_clock_that_errs_leaves_frames_of_even_length(times: list[float]) -> None:

@@ -139,7 +139,10 @@ def _times(timestamp_s: np.ndarray) -> np.ndarray:
     steps = np.diff(timestamp_s)
     if not ((steps > 0) & (steps < LEAP_S)).all():
         usual = steps[(steps >= 0) & (steps < LEAP_S)]
-        return (float(usual.mean()) if usual.any() else 1 / 25) * np.arange(len(timestamp_s))
+        later = usual[usual > 0]
+        # No mean: all frames would last longer because of one pause.
+        step = float(np.median(later)) * later.size / usual.size if later.size else 1 / 25
+        return step * np.arange(len(timestamp_s))
     return timestamp_s - timestamp_s[:1]
 
 
