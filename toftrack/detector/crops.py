@@ -58,7 +58,10 @@ def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:
 
 
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
-_LEAST_SLOPE, _RANGE = np.float32(0.05), float(np.float32(WIDE_RANGE_M))
+_LEAST_SLOPE = np.float32(0.05)
+_WIDE_RANGE = float(np.float32(WIDE_RANGE_M))
+"""In double precision: a kernel multiplies by the reciprocal, and only so the rounded quotient is
+the one that torch finds in training."""
 
 
 @shared_entry_point
@@ -189,7 +192,7 @@ def _read_wide(depth, rows, columns, image):
             inside = (rows[v] < height) & (columns[u] <= last)
             z = row[min(columns[u], last)]
             read = inside & (z > _ZERO)
-            image[0, v, u] = min(z / _RANGE, 1.0) if read else _ONE
+            image[0, v, u] = min(z / _WIDE_RANGE, 1.0) if read else _ONE
             image[1, v, u] = _ONE if read else _ZERO
 
 
