@@ -39,7 +39,7 @@ class PushDevice(BaseDevice):
             raise wrong_unit("the depth image", image, str(image.dtype))
         if image.shape != (self.camera.height, self.camera.width) or image.dtype.kind != "f":
             raise ToftrackError(
-                f"an image of {image.dtype}, shape {image.shape}, was pushed; give numbers, "
+                f"an image of {image.dtype}, shape {image.shape}, was pushed; give float metres, "
                 f"{self.camera.height} rows and {self.camera.width} columns as the camera has"
             )
         with suppress(queue.Empty):

@@ -19,9 +19,12 @@ LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
 _FULL_WORD, _NEAR_FULL = (65.535, 65_535.0), 1e-3
 """What many cameras say in metres or millimetres where there is no reading, as everywhere before a
 covered lens; relatively so near, as float16 has it."""
-_MILLIMETRES, _FARTHEST_MM = (100.0, 20_000.0), 4000.0
-"""A median between these is one of millimetres, unless they are centimetres, or all is farther than
-hands are: some cameras count tenths of millimetres."""
+NO_HAND_M = 4.0
+"""No hand is tracked from farther away."""
+_MILLIMETRES = (100.0, 20_000.0)
+"""A median between these is one of millimetres, unless it is one of centimetres. Where as
+millimetres nothing would be nearer than NO_HAND_M, it may be one of tenths, which some cameras
+count."""
 _NEAREST_CM, _LARGEST_CM = (15.0, 120.0), 1000.0
 """What is nearest in centimetres, and no median is more: as millimetres, these would be nearer than
 cameras measure."""
@@ -41,7 +44,7 @@ def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
     given = whole if kind else f"the median of {what}"
     if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
         unit, to_metres = "centimetres", 100
-    elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1] and nearest < _FARTHEST_MM:
+    elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1] and nearest < 1000 * NO_HAND_M:
         unit, to_metres = "millimetres", 1000
     else:
         return ToftrackError(

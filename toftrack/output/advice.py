@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from toftrack.frames.estimate import STATES, Estimate, is_vacant
+from toftrack.frames.frame import NO_HAND_M
 from toftrack.tracking.state import StepInfo
 
 _INSPECTED_PX = 5000
@@ -29,8 +30,6 @@ _TOO_NEAR_M = 0.22
 """Cameras measure badly there, and a hand does not fit into the image."""
 _NO_CAMERA_M = 0.1
 """No depth camera sees only what is nearer."""
-_NO_HAND_M = 4.0
-"""Nobody has a hand tracked from farther away."""
 _STRETCH = 60
 """So many frames are what is recent: long enough that advice does not flicker."""
 _FEWEST_FRAMES = 20
@@ -213,7 +212,7 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
             "There was hardly anything to see: check that the lens is free, that depth_m is not "
             "empty, and that its readings are not all invalid."
         ]
-    if facts.farthest_m < _NO_CAMERA_M or facts.nearest_m > _NO_HAND_M:
+    if facts.farthest_m < _NO_CAMERA_M or facts.nearest_m > NO_HAND_M:
         return ["No hand is tracked at that distance: check the unit, depth_m must be in metres."]
     found = []
     if mostly("out_of_reach"):

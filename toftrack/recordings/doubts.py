@@ -14,12 +14,12 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.frames.frame import median_reading, nearest_reading
+from toftrack.frames.frame import NO_HAND_M, median_reading, nearest_reading
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.npz import some_images
 
-_NO_CAMERA_M, _NO_SCENE_M, _NO_HAND_M = 0.1, 0.3, 4.0
-"""No camera sees what is nearer, no hand's background is so near, no hand is tracked so far."""
+_NO_CAMERA_M, _NO_SCENE_M = 0.1, 0.3
+"""No camera sees what is nearer, no hand's background is so near."""
 _NEAREST_M = (0.15, 1.5)
 """Between these lies what is nearest in an image of a hand."""
 _STEP_S, _FASTEST_S = (0.005, 5.0), 0.0005
@@ -80,7 +80,7 @@ def _images_doubt(store: FrameStore) -> str:
 def _unit_doubt(depth_m: np.ndarray, unit_m: float | None) -> str:
     """unit_m: metres of one step, where the images are whole numbers."""
     nearest, median = nearest_reading(depth_m), median_reading(depth_m)
-    if nearest > _NO_HAND_M:
+    if nearest > NO_HAND_M:
         where = f"nearly all readings are farther than {nearest:.3g} m, where no hand is tracked"
     elif nearest < _NO_CAMERA_M and median < _NO_SCENE_M:
         where = f"readings are as near as {nearest:.2g} m, half of them within {median:.2g} m"
