@@ -60,8 +60,8 @@ def test_a_hand_that_went_may_linger_for_three_frames() -> None:
 
 
 def test_a_hand_that_was_never_there_is_not_forgiven() -> None:
-    figures = figures_of(np.zeros((4, J, 3)), flags("...x"), hand([False] * 4))
-    assert (figures.silent_pct, figures.longest_silent) == (75, 3)
+    figures = figures_of(np.zeros((4, J, 3)), flags(".x.."), hand([False] * 4))
+    assert (figures.silent_pct, figures.longest_silent) == (75, 2)
     assert (figures.usable_pct, figures.visible) == (0, 0)
     assert figures.mean_mm is None and figures.mean_all_mm is None
 
