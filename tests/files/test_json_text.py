@@ -30,9 +30,10 @@ def test_what_cannot_be_meant_is_an_error(text: str, words: str, tmp_path: Path)
             load(tmp_path / "hostile.json")
 
 
-def test_the_mark_that_editors_of_windows_write_is_none_of_the_content(tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_text('{"a": 1}', "utf-8-sig")
-    assert read_json(tmp_path / "a.json") == {"a": 1}
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])  # the mark, as of Windows' editors
+def test_a_file_is_utf8_whatever_the_locale_is(tmp_path: Path, encoding: str) -> None:
+    (tmp_path / "a.json").write_text('{"é": [-2.5e3, true, null, 12345678901234567]}', encoding)
+    assert read_json(tmp_path / "a.json") == {"é": [-2500.0, True, None, 12345678901234567]}
 
 
 def test_a_file_that_is_too_large_is_not_parsed(
