@@ -16,9 +16,11 @@ from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
 LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
-_FULL_WORD, _NEAR_FULL = (65.535, 65_535.0), 1e-3
-"""What many cameras say in metres or millimetres where there is no reading, as everywhere before a
-covered lens; relatively so near, as float16 has it."""
+_FULL_WORDS = (65.535, 65_535.0)
+"""What many cameras say where there is no reading, as everywhere before a covered lens: the largest
+16-bit word, in metres and in millimetres."""
+_ROUNDED = 1e-3
+"""So far from it, in parts of it, is what float16 makes of it."""
 NO_HAND_M = 4.0
 """No hand is tracked from farther away."""
 _MILLIMETRES = (100.0, 20_000.0)
@@ -69,8 +71,8 @@ def nearest_reading(depth: np.ndarray) -> float:
 
 def _percentile(depth: np.ndarray, percent: float) -> float:
     readings = depth[(depth > 0) & (depth < np.inf)].astype(np.float32)
-    for full in _FULL_WORD:
-        readings = readings[abs(readings - full) > _NEAR_FULL * full]
+    for full in _FULL_WORDS:
+        readings = readings[abs(readings - full) > _ROUNDED * full]
     return float(np.percentile(readings, percent)) if readings.size else 0.0
 
 

@@ -218,8 +218,8 @@ _MODES = {
 """By the image's size (narrow binned, narrow, wide binned, wide): the sensor's width after
 binning, and where the image begins on it."""
 _MODELS = ("BrownConrady", "Rational6KT")
-"""Both are OpenCV's rational one; the second, which Orbbec's Femto names, counts a part of p1 and
-p2 half, a hundredth of a pixel."""
+"""Both are OpenCV's rational model. By the second, which Orbbec's Femto names, a term of p1 and p2
+counts half; that is a hundredth of a pixel."""
 _CALIBRATION = "calibration.json"
 _ADVICE = "give a calibrated camera with camera.file=FILE"
 

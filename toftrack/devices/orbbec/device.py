@@ -31,7 +31,7 @@ from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 
 _PIXELS = ("Y16", "Z16", "RLE", "RVL", "Y14", "Y12", "Y11", "Y10")
-"""Formats in which cameras send depth. Whatever is no Y16, the SDK makes one of."""
+"""Formats in which cameras send depth; of all of them the SDK makes 16-bit words."""
 _INFRARED = ("Y8", "Y16")
 _SLICE_S = 0.1  # of waiting, between looks at what else may have happened
 
