@@ -254,7 +254,7 @@ def test_a_training_may_end_elsewhere_while_its_rate_has_not_begun_to_fall(
 
 def test_a_system_without_glibc_keeps_its_memory_as_it_does(monkeypatch) -> None:
     def of_windows(name: None) -> None:
-        "/" in name  # noqa: B015
+        raise TypeError("argument of type 'NoneType' is not iterable")
 
     monkeypatch.setattr(ctypes, "CDLL", of_windows)
     batches.keep_memory()
