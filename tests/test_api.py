@@ -121,6 +121,7 @@ METRES = np.full((30, 40), 0.6, np.float32)
     [
         (METRES * 1000, K, "plainly millimetres"),
         (METRES * 10000, K, "neither metres nor millimetres"),  # as a D405 counts
+        (np.zeros((30, 40), np.uint16), K, "(uint16), of which none is a reading"),
         (METRES > 0, K, "float32 metres, but is bool"),
         (METRES[None], K, "(1, 30, 40)"),
         ([[0.1, 0.2], [0.3]], K, "NumPy arrays"),

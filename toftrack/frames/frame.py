@@ -42,8 +42,13 @@ def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
     depth: all of it, or a part.  kind: of whole numbers, which are no metres whatever they are.
     """
     median, nearest = median_reading(depth), nearest_reading(depth)
-    whole = f"{what} consists of whole numbers ({kind}), their median"
-    given = whole if kind else f"the median of {what}"
+    whole = f"{what} consists of whole numbers ({kind})"
+    if not median:  # as a camera's first images
+        return ToftrackError(
+            f"{whole}, of which none is a reading that would tell their unit; give float metres "
+            "(0 = no reading)"
+        )
+    given = f"{whole}, their median" if kind else f"the median of {what}"
     if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
         unit, to_metres = "centimetres", 100
     elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1] and nearest < 1000 * NO_HAND_M:
