@@ -242,6 +242,16 @@ def test_a_mat_file_that_would_fill_the_memory_is_refused(
         opened(tmp_path / "a.mat")
 
 
+def test_whole_numbers_of_a_mat_file_count_by_their_own_size(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program = matlab._PROGRAM.replace(str(2**30), str(WORDS.nbytes))
+    monkeypatch.setattr(matlab, "_PROGRAM", program)
+    assert len(opened(mat(tmp_path / "a.mat", depth=WORDS))) == COUNT
+    with pytest.raises(ToftrackError, match="larger than a gigabyte"):
+        opened(mat(tmp_path / "a.mat", depth=METRES))
+
+
 def test_a_matlab_file_that_crashes_its_reader_gives_one_sentence(tmp_path: Path) -> None:
     """As SciPy 1.17 does where the type of an array's elements is none."""
     savemat(tmp_path / "a.mat", {"a": METRES.astype(np.float64)})

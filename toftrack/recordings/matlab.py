@@ -28,7 +28,9 @@ if not names:
 (name,) = names
 if name not in there:
     raise ValueError(f"it has no array named {{name}}")
-if 8 * math.prod(there[name][0]) > {MOST_BYTES}:
+shape, kind = there[name]
+size = numpy.dtype(numpy.sctypeDict.get(kind, "f8")).itemsize
+if size * math.prod(shape) > {MOST_BYTES}:
     raise ValueError("it is larger than a gigabyte: save it with -v7.3")
 file.seek(0)
 array = loadmat(file, variable_names=names)[name]
