@@ -215,6 +215,24 @@ def sr305():
     save(depth, intrinsics(476.007, 476.007, 313.683, 242.755), labels=labels)
 
 
+def cup():
+    """A person moves a ball, a spoon and a cup on a table, seen from above: a stereo camera that is
+    not named, 640 x 360, 16 bit, millimetres. K makes the ball round (400 pixels, give or take 50).
+    The colour images lie some 24 pixels to the left.
+    """
+    depth = images(*(f"depth/{n:05d}.png" for n in range(207)))
+    save(np.stack(depth).astype(np.float32) / 1000, intrinsics(400.0, 400.0, 320, 180), fps=25.0)
+
+
+def hadjust():
+    """Eight poses of one right hand before a face: an Intel RealSense (by its K), 320 x 240, 16
+    bit, millimetres; K is the repository's (main/MAIN_CALIBRATE.m). labels: what each shows.
+    """
+    depth = np.stack(images(*(f"data/USER1/{n}/depth.png" for n in range(1, 9)))) / 1000
+    labels = np.array("palm other other other palm palm other palm".split())
+    save(depth, intrinsics(287.26, 287.26, 160, 120), labels=labels)
+
+
 def room(pattern, K, fps=1.0, commit="HEAD"):
     """Depth images without any hand, 16 bit, millimetres, 65535 = no reading, in the order of the
     numbers in their names. pattern: of their paths.
@@ -269,6 +287,7 @@ ROOMS = {
         intrinsics(571.6, 571.5, 316.0, 243.7),
     ),
     "office": (r"depths/.*\.png", intrinsics(615.0, 615.0, 320.0, 240.0), 30.0),
+    "person": (r"a1/data/\d+_depth\.png", intrinsics(525.0, 525.0, 320.0, 240.0)),
     "phone": (r"depth/.*\.png", intrinsics(213.0, 213.0, 96.0, 128.0)),
     "plane": (
         r"dataset/realsense/depth/.*\.png",
@@ -295,7 +314,8 @@ CAMCUBE = {
         " pointing palm four three_no_thumb victory pointing fist",
     ),
 }
-made = (adi_tof, bighand, fpha, hamer_depth, hololens, kinect1_room, nyu, r200_ceiling, sr305)
+made = (adi_tof, bighand, cup, fpha, hadjust, hamer_depth, hololens, kinect1_room, nyu)
+made += (r200_ceiling, sr305)
 MAKERS = {one.__name__: one for one in made}
 MAKERS |= {f"cvar_p{n}": lambda n=n: cvar(f"P{n}") for n in (1, 3, 4, 5, 6, 7)}
 MAKERS |= {
