@@ -49,13 +49,15 @@ def test_nothing_is_said_of_runs_that_went_well() -> None:
         ({"nearest_m": 0.15}, "keep the hand 0.3 to 1 m away"),
         ({"other_side": True}, "give hand.side=left"),
         ({"hand_px": 40}, "fewer than 150 pixels"),
+        ({"lost": 1, "tracked": 0}, "lost.believe_frames=1"),
         ({}, "must be a right hand (hand.side), upright and not mirrored"),
     ],
 )
 def test_each_cause_has_its_remedy(changes: dict, remedy: str) -> None:
-    seen, first, *more = advice(facts(**changes), "right", REACH_M)
+    whole = facts(**changes)
+    seen, first, *more = advice(whole, "right", REACH_M)
     assert remedy in first and not more
-    assert seen.startswith("60 of 100 frames")
+    assert seen.startswith("{lost} of {frames} frames".format(**whole.counts))
 
 
 def test_a_hand_of_the_other_side_that_is_followed_is_reported() -> None:

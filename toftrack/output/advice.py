@@ -233,6 +233,11 @@ def _remedies(facts: RunFacts, side: str | None, reach_m: float) -> list[str]:
             f"What was taken for the hand had fewer than {_FEWEST_PX} pixels: hold the hand "
             "nearer, or let the camera give larger images."
         )
+    if counts["frames"] < 3 and facts.states["searching"]:
+        found.append(
+            "A hand that is not sure at once is reported in its third frame; for single images "
+            "give lost.believe_frames=1."
+        )
     if not found:
         which = "a bare hand" if side is None else f"a {side} hand (hand.side)"
         found.append(
