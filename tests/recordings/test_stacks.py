@@ -242,6 +242,17 @@ def test_a_mat_file_that_would_fill_the_memory_is_refused(
         opened(tmp_path / "a.mat")
 
 
+@pytest.mark.parametrize("dataset", [None, "frames"])
+def test_images_in_a_cell_are_told_from_what_lies_beside_them(
+    tmp_path: Path, dataset: str | None
+) -> None:
+    cell = np.empty((2, 1), object)
+    cell[:, 0] = list(METRES[:2])
+    path = mat(tmp_path / "a.mat", frames=cell, boxes=np.ones((2, 4)))
+    with pytest.raises(ToftrackError, match=r"cat\(3, frames{:}\)"):
+        opened(path, dataset)
+
+
 def test_whole_numbers_of_a_mat_file_count_by_their_own_size(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -268,13 +279,6 @@ def test_modules_beside_a_matlab_file_are_not_run(
     (tmp_path / "numpy.py").write_text("raise SystemExit(1)")
     monkeypatch.chdir(tmp_path)
     assert len(opened(mat(tmp_path / "a.mat", depth=METRES))) == COUNT
-
-
-def test_objects_of_a_mat_file_are_no_images(tmp_path: Path) -> None:
-    cells = np.empty((2, 3, 4), object)
-    cells[:] = 1.0
-    with pytest.raises(ToftrackError, match="no array of images"):
-        opened(mat(tmp_path / "a.mat", depth=cells))
 
 
 def test_other_kinds_get_a_sentence_of_their_own_and_unknown_ones_are_no_archives(

@@ -211,11 +211,19 @@ def _mat(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
         if stream.read(10) == b"MATLAB 7.3":
             return _hdf5(path, wanted)
     with _reported(path):
+        variables = matlab_variables(path)
         there = {
             name: shape
-            for name, (shape, kind) in matlab_variables(path).items()
+            for name, (shape, kind) in variables.items()
             if kind in _NUMBERS and len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
         }
+        stacked = any(len(shape) == 3 for shape in there.values())
+        for name, (_, kind) in variables.items():
+            if kind == "cell" and (name == wanted or (wanted is None and not stacked)):
+                raise ToftrackError(
+                    f"'{path}' has its images in a cell, which is not read; save them as one "
+                    f"array, cat(3, {name}{{:}}), and give that"
+                )
         images = read_matlab(path, _chosen(path, wanted, there))
     return (images[None], _PYTHONS) if images.ndim == 2 else (images, _MATLABS)
 
