@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+from pathlib import Path
+
 import numpy as np
 import pytest
 
+from toftrack.errors import ToftrackError
 from toftrack.hand.regions import REGION_90
 from toftrack.tracking.confidence import FEATURES, JOINT_FEATURES
+from toftrack.training import fit_confidence
 from toftrack.training.fit_confidence import Observed, fitted_joint_belief, with_doubt
 
 FRAMES = 600
@@ -66,3 +71,13 @@ def test_doubt_of_joints_follows_the_new_log_odds_within_each_track() -> None:
     assert smooth == pytest.approx([2.0, 1.0, 4.0, 3.0, -4.0, -2.0])
     assert (np.delete(found, DOUBT, 2) == 1).all()
     assert (ones == 1).all()
+
+
+def test_too_few_sequences_are_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("random_sequence", "observed"):
+        monkeypatch.setattr(fit_confidence, name, lambda *_: None)
+    asked = Namespace(overrides=[], seed=1, sequences=1, frames=1, output=tmp_path)
+    with pytest.raises(ToftrackError, match="--sequences"):
+        fit_confidence.fit_confidence(asked)

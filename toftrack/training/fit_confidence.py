@@ -96,6 +96,11 @@ def fit_confidence(asked: argparse.Namespace) -> None:
         for number in numbers
     ]
     found = [part for part in parts if part is not None]
+    if len({int(part.sequence[0]) % _HELD_OUT == 0 for part in found}) < 2:
+        raise ToftrackError(
+            f"of {asked.sequences} sequences the tracker saw a hand in {len(found)}, too few to fit"
+            " and to check the fit; give more --sequences (200) or --frames (50)"
+        )
     seen = Observed(*map(np.concatenate, zip(*found, strict=True)))
     kept = seen.sequence % _HELD_OUT == 0
     log_odds, summary = _fitted_frames(seen, seen.right, kept)
