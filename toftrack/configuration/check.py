@@ -196,6 +196,10 @@ def check_tracker(config: DictConfig) -> None:
             f"{some} works only with networks, which experiment=paper lacks; leave {some} out,"
             " or leave experiment=paper out"
         )
+    if "start=rough" in given:  # which experiment=paper brings
+        raise ToftrackError(
+            "experiment=paper is the tracker without networks; leave it out, or the detector"
+        )
     raise ToftrackError(
         f"{some} belongs to experiment=paper; give experiment=paper as well, or leave {some} out"
     )
