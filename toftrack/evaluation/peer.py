@@ -25,7 +25,7 @@ from toftrack.frames.camera import Camera
 PEER = "mediapipe"
 SCRIPT = Path(__file__).with_name("peer_mediapipe.py")
 MAKE_ENVIRONMENT = (
-    "make one with: python3 -m venv peer && peer/bin/pip install mediapipe==0.10.21 'numpy<2'"
+    'make one with: python3 -m venv peer && peer/bin/pip install mediapipe==0.10.21 "numpy<2"'
 )
 _ANSWER = np.dtype(
     [("joints_m", "f8", (21, 3)), ("seconds", "f8"), ("sure", "f8"), ("right", "f8")]
