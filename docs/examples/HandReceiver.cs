@@ -10,9 +10,10 @@ using UnityEngine;
 public class HandReceiver : MonoBehaviour {
     static readonly Regex Joint = new Regex(@"\[(-?\d[^,\]]*),(-?\d[^,\]]*),(-?\d[^,\]]*)\]");
     readonly Transform[] joints = new Transform[21]; // 0 the wrist, 8 the index finger's tip
-    readonly UdpClient receiver = new UdpClient(new IPEndPoint(IPAddress.Loopback, 5005));
+    UdpClient receiver; // opened in Start: Unity's editor constructs components that never play, too
 
     void Start() {
+        receiver = new UdpClient(new IPEndPoint(IPAddress.Loopback, 5005));
         for (int i = 0; i < joints.Length; i++) {
             joints[i] = GameObject.CreatePrimitive(PrimitiveType.Sphere).transform;
             joints[i].SetParent(transform, false);
@@ -32,5 +33,5 @@ public class HandReceiver : MonoBehaviour {
 
     static float At(Match match, int part) => float.Parse(match.Groups[part].Value, CultureInfo.InvariantCulture);
 
-    void OnDestroy() => receiver.Close();
+    void OnDestroy() => receiver?.Close();
 }

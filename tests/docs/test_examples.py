@@ -127,7 +127,7 @@ namespace UnityEngine {
 }
 class Play {
     const System.Reflection.BindingFlags own = (System.Reflection.BindingFlags) 36;
-    static HandReceiver hand = new HandReceiver();
+    static HandReceiver hand = new HandReceiver(), unplayed = new HandReceiver();
     static void Call(string name) => typeof(HandReceiver).GetMethod(name, own).Invoke(hand, null);
     static void Main() {
         Call("Start");
