@@ -112,6 +112,19 @@ def test_a_bone_to_a_joint_that_is_not_ok_is_grey_and_of_one_piece(stream: Any, 
     assert (grey[top + 3 : lower] > 40).any(1).all()
 
 
+def test_a_drag_turns_the_hand_also_where_the_browser_tells_no_movement(
+    stream: Any, page: Any
+) -> None:
+    from selenium.webdriver.common.action_chains import ActionChains
+
+    page.get(stream.url)
+    page.execute_script("Object.defineProperty(MouseEvent.prototype, 'movementX', { value: 0 })")
+    before = page.execute_script("return turn[0]")
+    canvas = page.find_element("tag name", "canvas")
+    ActionChains(page).click_and_hold(canvas).move_by_offset(100, 0).release().perform()
+    assert page.execute_script("return turn[0]") == pytest.approx(before - 0.8, abs=0.02)
+
+
 def pointing(index: int, x: float, y: float, **changes: Any) -> Estimate:
     """A hand that points at a place of the screen, in parts of its width from its upper left."""
     origin = np.array([0.05, 0.1, 0.5])
