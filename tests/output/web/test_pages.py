@@ -112,6 +112,18 @@ def test_a_bone_to_a_joint_that_is_not_ok_is_grey_and_of_one_piece(stream: Any, 
     assert (grey[top + 3 : lower] > 40).any(1).all()
 
 
+def test_the_hand_comes_back_when_the_graphics_were_lost(stream: Any, page: Any) -> None:
+    page.get(stream.url)
+    before = select(page, stream, hand_estimate(1))
+    page.execute_script("window.loss = gl.getExtension('WEBGL_lose_context'); loss.loseContext()")
+    eventually(lambda: page.execute_script("return gl.isContextLost()"))
+    page.execute_async_script("setTimeout(arguments[0], 50)")  # it can be restored from then on
+    page.execute_script("loss.restoreContext()")
+    eventually(lambda: not page.execute_script("return gl.isContextLost()"))
+    page.get_log("browser")
+    assert select(page, stream, hand_estimate(2)).sum() > 0.9 * before.sum()
+
+
 def test_a_drag_turns_the_hand_also_where_the_browser_tells_no_movement(
     stream: Any, page: Any
 ) -> None:
