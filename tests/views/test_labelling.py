@@ -142,7 +142,10 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         for name in LABELLED[:-1]:
             assert chromium.execute_script("return labelling.joint") == name
             click(*truth[3, JOINT_NAMES.index(name)]).click().perform()
-        click(20, 20).click().perform()
+        click(20, 20).click_and_hold().perform()
+        chromium.execute_script("canvas.oncontextmenu(new PointerEvent('contextmenu'))")  # by touch
+        ActionChains(chromium).release().perform()
+        eventual("about.frames[0].points.wrist?.[2] === 'visible'")
         ActionChains(chromium).key_down("\ue009").send_keys("z").key_up("\ue009").perform()
         click(80, 80).context_click().perform()  # the wrist, not visible
         press("palm")
