@@ -155,7 +155,7 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         eventual("labelling.at === 1 && labelling.ready")
         press("Rest not visible")
         eventual("document.getElementById('told').textContent.startsWith('1 of 2 frames saved')")
-        for width in (1400, 400):
+        for width in (1400, 320):
             chromium.set_window_size(width, 900)
             wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert chromium.execute_script(f"return {wide}") <= 0
