@@ -1,7 +1,7 @@
 """A ROS 2 node that follows a hand: `python3 ros2_node.py --ros-args
--r depth:=/camera/depth/image_rect_raw -r camera_info:=/camera/depth/camera_info`. It takes
-rectified depth images, 16UC1 in mm or 32FC1 in m. While the hand is not lost it publishes
-`hand/joints` (PoseArray) and `hand/gesture` (String).
+-r depth:=/camera/camera/depth/image_rect_raw -r camera_info:=/camera/camera/depth/camera_info`,
+which are RealSense's topics. It takes rectified depth images, 16UC1 in mm or 32FC1 in m. While the
+hand is not lost it publishes `hand/joints` (PoseArray) and `hand/gesture` (String).
 """
 
 from __future__ import annotations
@@ -58,7 +58,9 @@ class HandNode(Node):  # type: ignore[misc]  # rclpy has no types
 
     def on_info(self, info: CameraInfo) -> None:
         if self.camera is None:
-            k = np.array(info.k, float).reshape(3, 3)
+            # What rectified images are seen through is P, which some drivers leave out.
+            p, k = np.reshape(info.p, (3, 4))[:, :3], np.reshape(info.k, (3, 3))
+            k = p if p[0, 0] > 0 else k
             self.camera = toftrack.PushDevice(toftrack.Camera(k, info.width, info.height))
             threading.Thread(target=self.follow, args=(self.camera,), daemon=True).start()
 

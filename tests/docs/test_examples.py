@@ -230,7 +230,9 @@ def test_ros_images_become_depth(ros: dict[str, Any]) -> None:
 
 def test_the_ros_node_publishes_the_joints_with_their_image_s_header(ros: dict[str, Any]) -> None:
     node, published = ros["HandNode"](), ros["published"]
-    info = Message(k=sample().k.ravel(), width=176, height=144)
+    projection = np.column_stack([sample().k, np.zeros(3)])
+    raw = np.diag([90.0, 90.0, 1.0])  # of the lens whose images were rectified
+    info = Message(k=raw.ravel(), p=projection.ravel(), width=176, height=144)
     node.on_image(image(sample().depth_m[0], "16UC1"))  # before the lens is known
     node.on_info(info)
     follower = threading.enumerate()[-1]
