@@ -193,10 +193,15 @@ def directory(width: int, height: int, following: int = 0, tile: int = 0) -> byt
     return b"II*\0" + struct.pack("<IH", 8, len(tags)) + entries + struct.pack("<I", following)
 
 
+LARGE = directory(60_000, 60_000)
+TWO_WIDTHS = LARGE[:8] + b"\6\0" + LARGE[10:22] + struct.pack("<HHII", 256, 4, 1, 1) + LARGE[22:]
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (directory(60_000, 60_000), "larger than any camera's"),
+        (LARGE, "larger than any camera's"),
+        (TWO_WIDTHS, "it is damaged"),
         (directory(32, 24, 0, 100_000), "tiles are larger"),
         (directory(32, 24, 8), "no end"),
         (b"II+\0" + bytes(4) + struct.pack("<Q", 2**63), "damaged"),

@@ -130,11 +130,14 @@ def _tiff_pages(stream: IO[bytes], head: bytes) -> list[Page]:
         stream.seek(at)
         (entries,) = count.unpack(stream.read(count.size))
         directory = stream.read(min(entries, 2**16) * entry.size + place.size)
-        stated = dict(_TAGS)
+        stated: dict[int, int] = {}
         for tag, kind, many, value in entry.iter_unpack(directory[: -place.size]):
-            if tag in _TAGS and many == 1 and kind in (3, 4):
-                (stated[tag],) = struct.unpack_from(order + "HI"[kind == 4], value)
-        width, height, bits, channels, number, *tile = stated.values()
+            if tag in _TAGS:
+                if tag in stated or kind not in (3, 4):  # decoders take the first, and other kinds
+                    raise ValueError("it is damaged")
+                (number,) = struct.unpack_from(order + "HI"[kind == 4], value)
+                stated[tag] = number if many == 1 else _TAGS[tag]
+        width, height, bits, channels, number, *tile = (_TAGS | stated).values()
         if tile[0] * tile[1] > LARGEST_PIXELS:
             raise ValueError("its tiles are larger than any camera's image")
         pages[at] = Page(width, height, channels, f"{'?uif'[number % 4]}{bits // 8}")
