@@ -148,6 +148,11 @@ def test_a_client_that_pings_and_never_reads_is_cut_off(stream: WebSocketStream)
     eventually(lambda: not stream._server.clients)
 
 
+def test_served_at_all_addresses_the_printed_one_can_be_opened() -> None:
+    with websocket_stream(host="0.0.0.0") as stream:
+        assert stream.url.startswith("http://127.0.0.1:") and answer(stream, "/")[0] == 200
+
+
 def test_a_host_that_can_be_no_name_is_one_sentence_and_leaves_no_thread() -> None:
     with pytest.raises(ToftrackError, match=r"nothing can be served at stream.host=a\.\.b"):
         websocket_stream(host="a..b").__enter__()

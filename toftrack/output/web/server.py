@@ -69,6 +69,8 @@ _CLOSING_S = 1.0
 _PAUSE_S = 0.01
 _LOOK_S = 0.25
 """A wait of the main thread in one piece, which Ctrl-C does not end on Windows."""
+_OPENED_AT = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+"""For all addresses at once, which no browser opens on Windows, that of this machine."""
 ANY_PORT = " (0 = any free one)"
 """What is said of a port that cannot be meant."""
 
@@ -171,6 +173,7 @@ class WebServer:
             of_system = error if isinstance(error, OSError) else OSError(str(error))
             raise _refused(group, host, port, of_system) from error
         at, port = next(iter(self._server.sockets)).getsockname()[:2]
+        at = _OPENED_AT.get(at, at)
         self.url = f"http://[{at}]:{port}/" if ":" in at else f"http://{at}:{port}/"
         """Of the first page."""
 
