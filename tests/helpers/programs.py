@@ -74,14 +74,19 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
 
 @contextmanager
 def interrupted_when(ready: Callable[[], object]) -> Iterator[None]:
-    """Ctrl-C comes as soon as `ready` says something true."""
+    """Ctrl-C comes as soon as `ready` says something true, or raises: then this raises it, too."""
     over = threading.Event()
+    raised: list[BaseException] = []
 
     def press() -> None:
-        while not over.wait(0.01):
-            if ready():
-                os.kill(os.getpid(), signal.SIGINT)
-                return
+        try:
+            while not ready():
+                if over.wait(0.01):
+                    return
+        except BaseException as error:
+            raised.append(error)
+        if not over.is_set():
+            os.kill(os.getpid(), signal.SIGINT)
 
     thread = threading.Thread(target=press)
     thread.start()
@@ -90,6 +95,8 @@ def interrupted_when(ready: Callable[[], object]) -> Iterator[None]:
     finally:
         over.set()
         thread.join()
+        for error in raised:
+            raise error
 
 
 def killed_when(ready: Callable[[], object], *words: str) -> None:
