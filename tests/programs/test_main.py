@@ -117,10 +117,11 @@ def test_a_sweep_of_a_recording_may_be_written_in_any_order(words: str) -> None:
     assert set(overrides) == {"device=replay", "device.path='a.npz'", "seed=1,2", "view=none"}
 
 
-def test_options_keep_their_values() -> None:
-    words = ["seed=1", "--config-dir", "my", "--info", "view=none", "--cfg", "job"]
-    assert options_first(words) == [
-        *("--config-dir", "my", "--info=all", "--cfg", "job", "seed=1", "view=none")
+@pytest.mark.parametrize(("given", "info"), [("--info", "all"), ("-i defaults", "defaults")])
+def test_options_keep_their_values(given: str, info: str) -> None:
+    words = ["seed=1", "--config-dir", "my", *given.split(), "view=none", "--cfg", "job"]
+    assert options_first(with_recording(words)) == [
+        *("--config-dir", "my", f"--info={info}", "--cfg", "job", "seed=1", "view=none")
     ]
 
 

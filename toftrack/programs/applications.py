@@ -38,6 +38,8 @@ _LONG = (
     "--config-path --config-name --config-dir --experimental-rerun --info"
 ).split()
 """All of Hydra's options."""
+_INFO = ("all", "config", "defaults", "defaults-tree", "plugins", "searchpath")
+"""What may follow Hydra's --info, or be left out."""
 _KEY = re.compile(r"[+~]{0,2}[\w./@:]+")
 
 
@@ -104,7 +106,7 @@ def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> lis
     others: list[str] = []
     files: list[str] = []
     value_follows = False
-    for argument in arguments:
+    for argument in _info_joined(arguments):
         if value_follows or not _is_file(argument, known):
             others.append(argument)
             value_follows = not value_follows and argument in _WITH_VALUE
@@ -161,15 +163,26 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     options: list[str] = []
     overrides: list[str] = []
     value_follows = False
-    for word in arguments:
+    for word in _info_joined(arguments):
         if word.startswith("-") and not value_follows:
             _check_option(word.partition("=")[0])
         if not word.startswith("-") and not value_follows:
             overrides.append(_readable(word))
-        else:  # the value of --info may be left out, and would be an override
-            options.append("--info=all" if word in ("--info", "-i") else word)
+        else:
+            options.append(word)
         value_follows = not value_follows and word in _WITH_VALUE
     return [*options, *overrides]
+
+
+def _info_joined(arguments: Sequence[str]) -> list[str]:
+    """The arguments with --info and its value as one word: left out, the next one would be it."""
+    words: list[str] = []
+    for word in arguments:
+        if words and words[-1] == "--info=all" and word in _INFO:
+            words[-1] = f"--info={word}"
+        else:
+            words.append("--info=all" if word in ("--info", "-i") else word)
+    return words
 
 
 def _check_option(word: str) -> None:
