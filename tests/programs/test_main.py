@@ -125,6 +125,28 @@ def test_options_keep_their_values(given: str, info: str) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("line", "offered"),
+    [
+        ("toftrack tr", {"track", "train"}),
+        ("toftrack track a.npz -m --cfg job seed=1,2 device=sa", {"device=sample"}),
+        ("toftrack train ", {"pose_space=", "data="}),
+        ("toftrack track ", {"hand.", "hands="}),
+    ],
+)
+def test_a_shell_completes_commands_and_settings(line, offered, capsys, monkeypatch) -> None:
+    monkeypatch.setenv("COMP_LINE", line)
+    assert front.main(["-sc", "query=bash"]) == 0
+    assert offered <= set(capsys.readouterr().out.split())
+
+
+@pytest.mark.parametrize(("called", "by"), [("bin/toftrack", "toftrack"), ("track.py", "python")])
+def test_completion_is_of_what_is_typed(called: str, by: str, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sys, "argv", [called])
+    assert front.main(["track", "-sc", "install=bash"]) == 0
+    assert capsys.readouterr().out.endswith(f"hydra_bash_completion {by}\n")
+
+
 @pytest.mark.parametrize("words", ["track --device sample", "track -o x", "recover", "export x"])
 def test_an_option_that_there_is_not_is_one_sentence(words: str, capsys) -> None:
     assert front.main(words.split()) == 1

@@ -84,6 +84,9 @@ def start(
     offer_installed()
     application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
     before = sys.argv
+    if "-sc" in arguments:  # Hydra tells a shell to complete what the program is called by
+        program = before[0]
+        os.environ["COMP_LINE"] = _line_to_complete(os.environ.get("COMP_LINE", ""))
     sys.argv = [program, *options_first(arguments)]
     try:
         with modest_files():
@@ -92,6 +95,15 @@ def start(
         shutdown.forget_streams()
     finally:
         sys.argv = before
+
+
+def _line_to_complete(line: str) -> str:
+    """A command line that a shell has for Hydra: one program, its settings, and the word that is
+    being typed. A recording's name, or most options, would be an error.
+    """
+    *words, last = line.split(" ")
+    settings = (word for word in words if "=" in word and word[0] != "-" or word == "-m")
+    return " ".join(["toftrack", *options_first([*settings]), last])
 
 
 def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import atexit
 import gc
 import importlib
+import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -87,6 +88,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         lines = [f"  {name:<{width}}  {about}" for name, about in _COMMANDS.items()]
         say(_OVERVIEW.format(commands="\n".join(lines)), sys.stdout)
         return 0
+    if given[0] == "-sc" and (line := os.environ.get("COMP_LINE")):  # a shell completes this
+        given = [*line.split()[1:2], *given]
+        if given[0] not in _LONG_HELP or line.count(" ") < 2:
+            say(" ".join(_COMMANDS), sys.stdout)
+            return 0
     name, rest = given[0], given[1:]
     if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
         say(f"toftrack {toftrack.__version__}", sys.stdout)
