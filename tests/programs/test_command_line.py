@@ -225,6 +225,17 @@ def test_the_programs_count_jobs_that_failed_elsewhere() -> None:
         assert isinstance(instantiate(config.hydra.callbacks.failed_jobs), FailedJobs)
 
 
+@pytest.mark.parametrize(("log", "files"), [("toftrack", 1), ("disabled", 0)])
+def test_a_log_takes_any_folder_s_name_and_may_be_left_out(log, files, tmp_path: Path) -> None:
+    folder = tmp_path / os.fsdecode(b"\xff")
+    logs = f"hydra/job_logging={log}", f"hydra/hydra_logging={log}"
+    words = ("device.stop=1", "view=none", f"hydra.run.dir={folder}", *logs, *programs.QUICK)
+    for _ in range(2):  # the second run logs which folder it replaces
+        status, _, err = programs.call(*words, folder=tmp_path)
+        assert status == 0 and "Logging error" not in err
+    assert len(list(folder.glob("*.log"))) == files
+
+
 def test_environment_is_as_before_after_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     assert run(lambda: None) == 0

@@ -114,9 +114,10 @@ def long_help(name: str) -> str:
     """What `toftrack track --help` prints."""
     folder = configuration_folder()
     groups = []
+    others = ("data", "hydra")
     for group in sorted(path for path in folder.iterdir() if path.is_dir()):
         choices = sorted(path.stem for path in group.glob("*.yaml"))
-        if (group.name in _GROUPS_OF_TRAINING) if name == "train" else group.name != "data":
+        if group.name in _GROUPS_OF_TRAINING if name == "train" else group.name not in others:
             groups.append(f"  {group.name:<14}{', '.join(choices)}")
     return _LONG_HELP[name].format(groups="\n".join(groups), folder=folder)
 
