@@ -236,6 +236,15 @@ def test_a_log_takes_any_folder_s_name_and_may_be_left_out(log, files, tmp_path:
     assert len(list(folder.glob("*.log"))) == files
 
 
+def test_a_run_that_hydra_pickled_runs_again(tmp_path: Path) -> None:
+    pickles = "+hydra.callbacks.p._target_=hydra.experimental.callbacks.PickleJobInfoCallback"
+    words = ("device.stop=1", "view=none", "hydra.run.dir=run", pickles, *programs.QUICK)
+    assert programs.call(*words, folder=tmp_path)[0] == 0
+    again = ("--experimental-rerun", "run/.hydra/config.pickle")
+    with pytest.warns(UserWarning, match="[Ee]xperimental"):
+        assert programs.call(*again, folder=tmp_path)[0] == 0
+
+
 def test_environment_is_as_before_after_a_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("HYDRA_FULL_ERROR", raising=False)
     assert run(lambda: None) == 0

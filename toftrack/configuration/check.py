@@ -84,7 +84,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     """Compare a composed configuration with what it would be if only options were chosen; raise
     ToftrackError with one sentence that names the setting.
 
-    Hydra must be initialised, as it is within `compose` and a job of `@hydra.main`.
+    Hydra is initialised within `compose` and a job of `@hydra.main`.
 
     name: of the configuration file.  overrides: of the command line.
     """
@@ -103,6 +103,8 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
             raise ToftrackError(
                 f"{word} is a setting of the tracker; give {word.partition('.')[2]} to train"
             )
+    if not GlobalHydra.instance().is_initialized():  # --experimental-rerun: it was checked then
+        return
     loader = GlobalHydra.instance().config_loader()
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     chosen = [o for o in parsed if not o.is_delete() and loader.get_group_options(o.key_or_group)]
