@@ -17,6 +17,7 @@ import pytest
 
 from toftrack.compute import compiling
 from toftrack.compute.compiling import Kernel, compiled, entry_point
+from toftrack.errors import ToftrackError
 
 FACTOR = 2.0
 
@@ -141,6 +142,12 @@ def test_what_others_could_have_written_is_never_unpickled(
     assert not (tmp_path / "executed").exists()
     (message,) = caplog.messages
     assert "closed to others" in message and str(folder) in message
+
+
+def test_numba_without_its_compiler_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
+    with pytest.raises(ToftrackError, match="NUMBA_DISABLE_JIT"):
+        _made()(np.zeros(1))
 
 
 def test_an_error_of_a_kernel_s_own_is_raised() -> None:

@@ -26,6 +26,7 @@ from numba import types
 from numba.extending import intrinsic
 
 from toftrack.compute.collector import collector_paused
+from toftrack.errors import ToftrackError
 
 log = logging.getLogger(__name__)
 
@@ -119,6 +120,10 @@ def _only_one_process(cache_path: str | None) -> Iterator[None]:
 
 def _cached(function: Callable, options: dict[str, Any]) -> Any:
     """numba's function with a cache, or without one where it cannot be trusted or written."""
+    if _config.DISABLE_JIT:  # kernels have parts that only the compiler knows
+        raise ToftrackError(
+            "NUMBA_DISABLE_JIT keeps toftrack's kernels from being compiled; unset it"
+        )
     before = _config.CACHE_DIR
     try:
         folder = _private_folder() / _fingerprint(function)
