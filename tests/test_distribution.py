@@ -69,6 +69,9 @@ def test_a_type_checker_in_another_folder_knows_the_types(site: Path, tmp_path: 
     pytest.importorskip("mypy")
     (tmp_path / "client.py").write_text(
         "import toftrack\n"
+        "from toftrack import *\n"
+        "reveal_type(read_run)\n"
+        "toftrack.make_racket\n"
         "estimate = toftrack.make_tracker().step([[0.5]], [[1.0]])\n"
         "reveal_type(estimate.confidence)\n"
         "reveal_type(toftrack.read_run('x').camera)\n"
@@ -78,6 +81,8 @@ def test_a_type_checker_in_another_folder_knows_the_types(site: Path, tmp_path: 
     assert 'Revealed type is "float"' in said, said
     assert 'Revealed type is "toftrack.frames.camera.Camera"' in said
     assert '"Estimate" has no attribute "no_such_field"' in said
+    assert 'Revealed type is "def (folder: ' in said, "import * brings the names"
+    assert 'Module has no attribute "make_racket"' in said
 
 
 def test_an_editable_installation_is_the_path_of_the_checkout(

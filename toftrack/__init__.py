@@ -81,21 +81,20 @@ _PLACES = {
     "track": "toftrack.programs.in_python",
 }
 
-__all__ = sorted((*_PLACES, "__version__"))
+if not TYPE_CHECKING:  # checkers would take any name for one of ours, and find none in `import *`
+    __all__ = sorted((*_PLACES, "__version__"))
 
+    def __getattr__(name: str) -> Any:
+        if name == "__version__":
+            from importlib.metadata import version
 
-def __getattr__(name: str) -> Any:
-    if name == "__version__":
-        from importlib.metadata import version
+            value = version("toftrack")
+        elif name in _PLACES:
+            value = getattr(import_module(_PLACES[name]), name)
+        else:
+            raise AttributeError(f"module 'toftrack' has no attribute {name!r}")
+        globals()[name] = value
+        return value
 
-        value: Any = version("toftrack")
-    elif name in _PLACES:
-        value = getattr(import_module(_PLACES[name]), name)
-    else:
-        raise AttributeError(f"module 'toftrack' has no attribute {name!r}")
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    def __dir__() -> list[str]:
+        return sorted({*globals(), *__all__})
