@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
+import pydoc
 import subprocess
 import sys
 import threading
+import typing
 from functools import cache
 from pathlib import Path
 
@@ -205,6 +207,8 @@ def test_help_shows_every_field_with_what_is_written_below_it() -> None:
         below = shown.split(f"\n    {field.name}: ")[1].splitlines()[1]
         assert below.startswith(" " * 8) and len(below.split()) > 2, field.name
     assert "(21, 3) float32 metres, camera frame" in shown
+    assert typing.get_type_hints(toftrack.Estimate)["landmarks"] is np.ndarray
+    assert "lambda" not in pydoc.render_doc(toftrack.Estimate), "nor its place in memory"
 
 
 @pytest.mark.parametrize("kind", ["depth", "amplitude", "colours"])

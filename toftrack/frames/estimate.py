@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from typing import Any, Self, overload
+from typing import Any, Self
 
 import numpy as np
 
@@ -25,26 +25,26 @@ STATES = {
 """What the tracker does, Estimate.state_name, and how it is said to people."""
 
 
-class ArrayOnDemand:
+class _ArrayOnDemand:
     """A field of a dataclass that may be given as a function without arguments: it is called when
     the field is first read. What few programs read then costs the others nothing."""
 
-    def __init__(self, *shape: int, kind: type = np.float64) -> None:
-        """shape, kind: of the default, an array of NaN."""
+    def __init__(self, shape: tuple[int, ...], kind: type) -> None:
         self._shape, self._kind, self._name = shape, kind, ""
 
     def __set_name__(self, owner: type, name: str) -> None:
         self._name = name
 
-    @overload
-    def __get__(self, instance: None, owner: type) -> Callable[[], np.ndarray]: ...
+    def __call__(self) -> np.ndarray:
+        """The default."""
+        return np.full(self._shape, np.nan, self._kind)
 
-    @overload
-    def __get__(self, instance: object, owner: type) -> np.ndarray: ...
+    def __repr__(self) -> str:  # in signatures
+        return "<NaN>"
 
     def __get__(self, instance: object | None, owner: type) -> Any:
         if instance is None:  # the dataclass asks for the default
-            return lambda: np.full(self._shape, np.nan, self._kind)
+            return self
         value = vars(instance)[self._name]
         if callable(value):
             value = vars(instance)[self._name] = value()
@@ -52,6 +52,11 @@ class ArrayOnDemand:
 
     def __set__(self, instance: object, value: np.ndarray | Callable[[], np.ndarray]) -> None:
         vars(instance)[self._name] = value
+
+
+def _on_demand(*shape: int, kind: type = np.float64) -> Any:
+    """For readers and type checkers the field is the array that it becomes."""
+    return _ArrayOnDemand(shape, kind)
 
 
 @fields_in_help
@@ -79,7 +84,7 @@ class Estimate:
     """(d,) float32 pose-space coordinates."""
     score: float
     """The likelihood head's score, 0..1."""
-    covariance: ArrayOnDemand = ArrayOnDemand(10, 10)
+    covariance: np.ndarray = _on_demand(10, 10)
     """(6 + d, 6 + d) float32 over translation, rotation (tangent space) and latent."""
     effective_sample_size: float = math.nan
     """Of the weights, before resampling."""
@@ -104,7 +109,7 @@ class Estimate:
     where gesture output is off, the hand is lost, or too little is known of their last joints."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
-    joint_sigma_m: ArrayOnDemand = ArrayOnDemand(21, 3, kind=np.float32)
+    joint_sigma_m: np.ndarray = _on_demand(21, 3, kind=np.float32)
     """(21, 3) float32 standard deviations of the joints along the camera's ray, along the finger
     and across both; see hand/regions.py. NaN where nothing says."""
     joint_confidence: np.ndarray = field(default_factory=lambda: np.full(21, np.nan, np.float32))
@@ -117,16 +122,16 @@ class Estimate:
     the thumb stretched away, else NaN."""
     pointing_direction: np.ndarray = field(default_factory=lambda: np.full(3, np.nan, np.float32))
     """(3,) float32 unit vector from there to the finger's tip, else NaN."""
-    landmarks: ArrayOnDemand = ArrayOnDemand(21, 3)
+    landmarks: np.ndarray = _on_demand(21, 3)
     """(21, 3) the joints as MediaPipe's landmarks: x, y in parts of the image's width and height, z
     the depth beyond the wrist's in parts of the width; see hand/conventions.py."""
     image_size_px: tuple[int, int] | None = None
     """Width and height of the image, which `landmarks` are in parts of; None where nobody says."""
-    openxr_position_m: ArrayOnDemand = ArrayOnDemand(26, 3)
+    openxr_position_m: np.ndarray = _on_demand(26, 3)
     """(26, 3) metres, the joints of XR_EXT_hand_tracking; x right, y up, -z forward."""
-    openxr_orientation: ArrayOnDemand = ArrayOnDemand(26, 4)
+    openxr_orientation: np.ndarray = _on_demand(26, 4)
     """(26, 4) unit quaternions x y z w of these joints; see hand/openxr.py for their axes."""
-    openxr_radius_m: ArrayOnDemand = ArrayOnDemand(26)
+    openxr_radius_m: np.ndarray = _on_demand(26)
     """(26,) metres from these joints to the skin."""
 
     def __repr__(self) -> str:

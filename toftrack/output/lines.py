@@ -18,7 +18,7 @@ import numpy as np
 from toftrack.errors import ToftrackError
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_to_read
-from toftrack.frames.estimate import ArrayOnDemand, Estimate, is_vacant
+from toftrack.frames.estimate import Estimate, is_vacant
 
 _KINDS: dict[type, type] = {
     bool: np.bool_,
@@ -26,7 +26,6 @@ _KINDS: dict[type, type] = {
     float: np.float32,
     str: np.str_,
     np.ndarray: np.float32,
-    ArrayOnDemand: np.float32,
 }
 _EXACT: dict[str, type] = {"timestamp_s": np.float64, "joint_ok": np.bool_}
 """Fields of another type than their kind's."""
@@ -57,7 +56,7 @@ SHAPES: dict[str, tuple[int, ...]] = {
     "joints_m": (21, 3),
     "state": (27,),
     "joint_ok": (21,),
-    **{name: () for name in KINDS if _HINTS[name] not in (np.ndarray, ArrayOnDemand)},
+    **{name: () for name in KINDS if _HINTS[name] is not np.ndarray},
 }
 """Of the fields of a hand whose shape does not depend on the run."""
 

@@ -246,9 +246,8 @@ def make_estimate(
         state=_host(pose[0]),
         latent=_host(latent[0]),
         score=score,
-        covariance=lambda: covariance_of(filtered, model),
         effective_sample_size=float(effective),
-    )
+    ).updated(covariance=lambda: covariance_of(filtered, model))
 
 
 @small_operations()
