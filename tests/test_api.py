@@ -153,6 +153,15 @@ def test_a_bad_image_does_not_disturb_the_track() -> None:
     assert (before.index, after.index, after.state_name) == (2, 3, "tracking")
 
 
+def test_an_estimate_changed_in_place_does_not_change_the_next_one() -> None:
+    scene, tracker = sample(), toftrack.make_tracker(*QUICK)
+    estimate = tracker.step(scene.depth_m[0], scene.k)
+    found = estimate.joints_m.copy()
+    estimate.joints_m[:] = 0
+    lost = tracker.step(np.zeros_like(scene.depth_m[0]), scene.k)
+    assert lost.lost and np.array_equal(lost.joints_m, found), "the last one stands"
+
+
 def test_a_configuration_of_one_s_own(tmp_path: Path) -> None:
     (tmp_path / "config.yaml").write_text("seed: 5\n")
     assert configuration("seed=6", config_dir=tmp_path) == {"seed": 6}

@@ -86,7 +86,7 @@ class HandsTracker:
             model = self.model.at_quality(quality)
             self.state, self.infos, estimates = _step(self.state, image, model)
         of_frame = {"compute_s": self.time.took_s(), "image_size_px": depth_m.shape[::-1]}
-        return tuple(estimate.updated(**of_frame) for estimate in estimates)
+        return tuple(_own(estimate).updated(**of_frame) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:
@@ -208,6 +208,12 @@ class Tracker:
     def shape(self) -> HandShape:
         """The hand that the next frame is compared with."""
         return self.hands.shapes[0]
+
+
+def _own(estimate: Estimate) -> Estimate:
+    """With arrays that the caller may change: the state keeps the last estimate for lost frames."""
+    arrays = {name: a for name, a in vars(estimate).items() if isinstance(a, np.ndarray)}
+    return estimate.updated(**{name: array.copy() for name, array in arrays.items()})
 
 
 def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepResult:
