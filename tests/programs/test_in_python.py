@@ -53,6 +53,7 @@ def test_the_estimates_and_results_are_those_of_the_command_line(
     again, last = results.estimates(-1)[1], estimates[-1]
     assert (again.side, again.confidence) == (last.side, np.float32(last.confidence))
     assert str(results) == "<Results: 3 frames, 2 slots, 0% lost>" and "joints_m" in dir(results)
+    assert all(hasattr(results, name) for name in dir(results)), "what completion offers is there"
     with pytest.raises(AttributeError, match="no array 'joint_m'; it has index, .*joints_m"):
         _ = results.joint_m
 

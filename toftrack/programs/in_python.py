@@ -172,7 +172,8 @@ class Results:
         return value
 
     def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *self.content})
+        arrays = (name for name, it in self.content.items() if isinstance(it, np.ndarray))
+        return sorted({*super().__dir__(), *arrays})
 
     def __repr__(self) -> str:
         slots = f"{self.lost.shape[1]} slots, " if self.lost.ndim > 1 else ""
