@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import torch
 
     from toftrack.compute.quality import Pace
-    from toftrack.devices.base import Device
+    from toftrack.devices.base import BaseDevice
     from toftrack.tracking.backend import Backend
     from toftrack.tracking.model import FilterModel
     from toftrack.tracking.tracker import HandsTracker, Tracker
@@ -65,7 +65,7 @@ def make_hands_tracker(*overrides: str, config_dir: str | Path | None = None) ->
         return build_hands_tracker(config)
 
 
-def make_device(*overrides: str, config_dir: str | Path | None = None) -> Device:
+def make_device(*overrides: str, config_dir: str | Path | None = None) -> BaseDevice:
     """The camera or recording of `python track.py` with these overrides, for a `with` and a `for`.
 
     Its frames are as the camera took them; `device.camera.rectify(frame.depth, frame.radial)` is

@@ -3,6 +3,7 @@ picture of the rooms is that of the code; docs/figures.json is the one source of
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import sys
@@ -64,6 +65,22 @@ def test_every_page_stands_in_the_navigation_and_every_public_name_in_the_refere
     reference = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     shown = set(re.findall(r"^::: toftrack\.(\w+)$", reference, re.M))
     assert shown == set(toftrack.__all__) - {"__version__"}
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        (toftrack.BaseDevice, "camera fps frames truth live dropped description metadata"),
+        (toftrack.Tracking, "device camera depth_m"),
+        (toftrack.Camera, "K width height distortion"),
+        (toftrack.Run, "folder results frames"),
+    ],
+)
+def test_the_reference_shows_every_attribute_with_what_it_is(kind: type, names: str) -> None:
+    """mkdocs shows those alone that are assigned by themselves and have a text below."""
+    source = inspect.getsource(kind)
+    for name in names.split():
+        assert re.search(rf'^ +(self\.)?{name}(: .+| = .+)\n +"""', source, re.M), name
 
 
 def test_the_notebook_becomes_a_page() -> None:

@@ -28,13 +28,18 @@ class BaseDevice:
         live: bool = False,
     ) -> None:
         check_number("fps", fps, 0, above=True)
-        self.camera, self.fps = camera, float(fps)
-        """Of the images; what the overlay video plays at."""
-        self.frames, self.truth = frames, truth
-        """How many frames an iteration yields at most (None: unknown); a row for each."""
-        self.live, self.dropped = live, 0
-        """Frames do not wait: the newest is delivered, and what comes too late is dropped; frames
-        of the latest iteration that nobody was there to take, 0 unless `live`."""
+        self.camera = camera
+        """Of the images."""
+        self.fps = float(fps)
+        """Frames a second, at which the overlay video plays."""
+        self.frames = frames
+        """How many an iteration yields at most; None: unknown."""
+        self.truth = truth
+        """With a row for each of them; None where there is none."""
+        self.live = live
+        """Frames do not wait: the newest is delivered, and what comes too late is dropped."""
+        self.dropped = 0
+        """Frames of the latest iteration that nobody was there to take; 0 unless `live`."""
         self.description: dict[str, Any] = {"device": type(self).__name__}
         """Facts for the result's metadata, JSON-able."""
         self.metadata: dict[str, Any] = {}

@@ -101,8 +101,9 @@ class Camera:
     K: np.ndarray
     """(3, 3) float64, pixels."""
     width: int
-    """Pixels, as the height."""
+    """Pixels."""
     height: int
+    """Pixels."""
     distortion: np.ndarray = field(default_factory=lambda: np.zeros(5))
     """(4,), (5,), (8,), (12,) or (14,) float64: OpenCV's k1 k2 p1 p2, k3, k4 k5 k6, s1 s2 s3 s4,
     tauX tauY; of a `fisheye` (4,), its k1 k2 k3 k4."""

@@ -43,6 +43,7 @@ class Run:
     """A finished run: T frames, a row for each; see `read_run`."""
 
     folder: Path
+    """Where it is."""
     results: dict[str, Any] = field(repr=False)
     """Of `read_results`: the arrays of track.npz, `joint_names` and `metadata`."""
     frames: np.ndarray = field(repr=False)

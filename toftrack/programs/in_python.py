@@ -95,10 +95,14 @@ class Tracking:
     """
 
     def __init__(self, config: DictConfig, device: BaseDevice) -> None:
-        self._config, self.device = config, device
+        self._config = config
         self._metadata: dict[str, Any] = {}
-        self.camera, self.depth_m = device.camera, np.zeros((0, 0), np.float32)
-        """Of the newest estimate; (H, W) metres, 0 = no reading: its rectified image."""
+        self.device = device
+        """What delivers the frames."""
+        self.camera = device.camera
+        """Of the newest estimate."""
+        self.depth_m: np.ndarray = np.zeros((0, 0), np.float32)
+        """(H, W) metres, 0 = no reading: the rectified image of the newest estimate."""
 
     def __iter__(self) -> Iterator[Estimate]:
         for _, smoothed in self._frames():
