@@ -80,6 +80,11 @@ def test_an_estimate_prints_itself_in_a_line(estimate: toftrack.Estimate, said: 
     assert f"{estimate}".endswith(f"{said}>") and repr(estimate) == str(estimate)
 
 
+def test_a_misspelled_field_is_reported() -> None:
+    with pytest.raises(TypeError, match="joint_m"):
+        hand_estimate(0).updated(joint_m=NOWHERE)
+
+
 def test_three_lines_track(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     scene = sample()

@@ -147,6 +147,8 @@ class Estimate:
 
     def updated(self, **changes: Any) -> Self:
         """With other values of some fields, as dataclasses.replace; what is on demand stays so."""
+        if unknown := changes.keys() - vars(self).keys():
+            raise TypeError(f"an Estimate has no field {', '.join(sorted(unknown))}")
         made = object.__new__(type(self))
         vars(made).update(vars(self) | changes)
         return made
