@@ -67,6 +67,7 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
     footage = run.footage()
     assert footage is not None, "figures are drawn with the same lens"
     np.testing.assert_array_equal(footage.camera.K, K)
+    assert len(repr(footage)) < 200
 
 
 @pytest.mark.parametrize("given", ["[200,200,88]", "[-1,200,88,72]", "200", "[1,1,88,72]"])

@@ -190,7 +190,7 @@ class Run:
             return kind(**settings)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)  # of a recording it would fill the terminal
 class Footage:
     """The images of a run's T frames, and their truth: `depth(row)` and `amplitude(row)`."""
 
