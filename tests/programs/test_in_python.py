@@ -156,10 +156,13 @@ def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:
         ([tmp_path / "gone.npz"], "there is no file"),
         (["device=sample", "hand.syde=left"], "did you mean"),
         (["device=sample", "a.npz"], "both give the frames"),
+        ([np.zeros((9, 144, 176))], "but not ndarray"),
         ([Camera(3), "device.stop=2"], "track was given a device, a Camera; leave one out"),
     ):
         with pytest.raises(toftrack.ToftrackError, match=said):
             toftrack.track(*words)
+    with pytest.raises(toftrack.ToftrackError, match="was given ndarray"):
+        toftrack.PushDevice(np.eye(3))
 
 
 def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:

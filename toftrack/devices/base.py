@@ -28,6 +28,9 @@ class BaseDevice:
         live: bool = False,
     ) -> None:
         check_number("fps", fps, 0, above=True)
+        if not isinstance(camera, Camera):
+            kind = type(camera).__name__
+            raise ToftrackError(f"a device needs Camera(K, width, height), but was given {kind}")
         self.camera = camera
         """Of the images."""
         self.fps = float(fps)

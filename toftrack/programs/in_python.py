@@ -80,6 +80,11 @@ def track(
                     f"{type(source).__name__}; leave one out"
                 )
         return Tracking(configuration("view=none", *overrides, config_dir=config_dir), source)
+    if not isinstance(source, str | os.PathLike):
+        raise ToftrackError(
+            f"track takes the name of a recording, or a device, but not {type(source).__name__}; "
+            "images of your own go to make_tracker().step, or into a PushDevice"
+        )
     words = with_recording([os.fspath(source), *overrides], [str(config_dir)] if config_dir else [])
     config = configuration("view=none", *words, config_dir=config_dir)
     with one_sentence():
