@@ -262,13 +262,14 @@ def test_the_client_of_standard_output_gets_every_frame(
     assert read(printed.splitlines()) == list(range(6))
 
 
-def test_the_client_of_datagrams_gets_every_frame(tmp_path: Path) -> None:
+@pytest.mark.parametrize("gestures", ["default", "none"])
+def test_the_client_of_datagrams_gets_every_frame(gestures: str, tmp_path: Path) -> None:
     port = str(free_port(socket.SOCK_DGRAM))
     assert "5005" in " ".join(word for words in TRACK for word in words)
     ready = ("while True", 'print("ready", flush=True)\nwhile True')
     with client("udp-client", tmp_path, ready, ("5005", port)) as process:
         assert process.stdout.readline() == "ready\n"
-        send("udp", tmp_path, f"stream.port={port}")
+        send("udp", tmp_path, f"stream.port={port}", f"gestures={gestures}")
         assert read([process.stdout.readline() for _ in range(6)]) == list(range(6))
 
 
