@@ -97,4 +97,4 @@ if not TYPE_CHECKING:  # checkers would take any name for one of ours, and find 
         return value
 
     def __dir__() -> list[str]:
-        return sorted({*globals(), *__all__})
+        return __all__  # and not our own imports
