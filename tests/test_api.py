@@ -250,6 +250,8 @@ def test_what_cannot_be_drawn_is_reported() -> None:
     scene, estimate = sample(), _estimate()
     with pytest.raises(toftrack.ToftrackError, match="of the shape \\(3,\\)"):
         toftrack.draw(np.zeros(3), estimate, scene.k)
+    with pytest.raises(toftrack.ToftrackError, match="scale=0"):
+        toftrack.draw(scene.depth_m[0], estimate, scene.k, scale=0)
     small = toftrack.Camera(np.array([[50.0, 0, 20], [0, 50, 15], [0, 0, 1]]), 40, 30)
     with pytest.raises(toftrack.ToftrackError, match="but the camera 40x30"):
         toftrack.draw(scene.depth_m[0], estimate, small)

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import (
     Estimate,
@@ -339,6 +339,7 @@ def draw(
             " give the camera that the image is of"
         )
     factor = panel_scale(width) if scale is None else scale
+    check_number("scale", factor, 0, above=True)
     size = (max(1, round(width * factor)), max(1, round(height * factor)))
     estimates = (estimate,) if isinstance(estimate, Estimate) else tuple(estimate)
     smooth = np.asarray(image).dtype.kind != "f"
