@@ -30,8 +30,8 @@ from toftrack.files.safe_files import open_to_read, whole_file
 
 MOST_BYTES = 2**30
 """An array of more than a gigabyte is not loaded."""
-MOST_TEXT_BYTES = 2**24
-"""Nor a text of more than 16 MB: a page of JSON is some kilobytes."""
+MOST_TEXT_BYTES = 2**26
+"""Nor a text of more than 64 MB, nor so many texts: the names of a day's images take some."""
 _MOST_RATIO, _SMALL_BYTES = 1000, 2**26
 """What shrank to less than a thousandth was made to fill memories, unless it is small anyway;
 depth and amplitude images of real cameras shrink to a tenth to a fortieth."""
@@ -99,11 +99,10 @@ class Archive:
         with self._opened(name) as (_, header):
             return header
 
-    def read(self, name: str) -> np.ndarray:
-        """An array as a whole; of more than a gigabyte it is refused."""
+    def read(self, name: str, most_bytes: int | None = None) -> np.ndarray:
+        """An array as a whole; of more than so many bytes, or a gigabyte, it is refused."""
         with self._opened(name) as (stream, header):
-            if header.size > MOST_BYTES:
-                raise ValueError(f"it is larger than {MOST_BYTES / 1e9:.1f} GB")
+            _check_size(header.size, most_bytes)
             content = bytearray()
             while piece := stream.read(min(_PIECE_BYTES, header.size - len(content))):
                 content += piece
@@ -157,9 +156,12 @@ class _Packed(io.RawIOBase):
         return piece
 
 
-def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict[str, np.ndarray]:
+def read_archive(
+    path: str | Path, names: Collection[str] | None = None, most_bytes: int | None = None
+) -> dict[str, np.ndarray]:
     """All arrays of an .npz file by name, or those of some names that are there.
 
+    most_bytes: of all together; None = a gigabyte.
     Raises FileNotFoundError; another OSError when it cannot be read; ValueError, saying in few
     words why, when it is no .npz archive, is cut off or damaged, too large to be meant, or holds
     pickled objects.
@@ -167,9 +169,8 @@ def read_archive(path: str | Path, names: Collection[str] | None = None) -> dict
     with open_to_read(path) as stream:
         archive = Archive(stream)
         wanted = [name for name in archive.names if names is None or name in names]
-        if sum(archive.header(name).size for name in wanted) > MOST_BYTES:
-            raise ValueError(f"it is larger than {MOST_BYTES / 1e9:.1f} GB")
-        return {name: archive.read(name) for name in wanted}
+        _check_size(sum(archive.header(name).size for name in wanted), most_bytes)
+        return {name: archive.read(name, most_bytes) for name in wanted}
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,11 +251,19 @@ def _header(stream: IO[bytes]) -> Header:
     return Header(shape, kind, fortran_order, 8 + len(counted) + length)
 
 
+def _check_size(size: int, most_bytes: int | None) -> None:
+    most = MOST_BYTES if most_bytes is None else most_bytes
+    if size > most:
+        raise ValueError(f"it is larger than {most / 1e9:.1f} GB")
+
+
 def _check(header: Header, entry: zipfile.ZipInfo) -> None:
     if min(header.shape, default=0) < 0 or header.offset + header.size != entry.file_size:
         raise ValueError("it is of another length than its header says")
-    if header.kind.kind in "US" and header.size > MOST_TEXT_BYTES:
-        raise ValueError(f"it is a text of {header.size / 1e6:.0f} MB")
+    # A column of words is long where a run is.
+    of_text = header.kind.itemsize, 4 * math.prod(header.shape)
+    if header.kind.kind in "US" and max(of_text) > MOST_TEXT_BYTES:
+        raise ValueError(f"it is text of {header.size / 1e6:.0f} MB")
     if entry.file_size > max(_SMALL_BYTES, _MOST_RATIO * entry.compress_size):
         raise ValueError(
             f"it would unpack {entry.compress_size} bytes to {entry.file_size / 1e6:.0f} MB"

@@ -32,6 +32,8 @@ _VERSION = 1
 _MOST_HELD = 10_000_000
 """Dropped frames between others, 4 days of them; more are none, but a damaged number."""
 _MOST_DIMS = 100
+_MOST_BYTES = 2**34
+"""Of a track.npz, of which a hand takes 2.4 kB a frame: two hands for a day."""
 _TEXTS = ("joint_names", "metadata")
 _PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
 """Of the metadata: what is said of each."""
@@ -167,8 +169,6 @@ def finish(
     metadata = facts["metadata"]
     rows, changed = _every_frame(records)
     dropped = changed[DROPPED]
-    if dropped.any():
-        metadata = metadata | {"held_frames": changed["index"][dropped].tolist()}
     small = {
         "joint_names": np.array(facts["joint_names"], np.str_),
         "metadata": np.array(json.dumps(metadata)),
@@ -233,7 +233,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
     path = Path(path).expanduser()
     try:
         names = (*KINDS, DROPPED, *_TEXTS)
-        arrays = read_archive(path, set(names))
+        arrays = read_archive(path, set(names), _MOST_BYTES)
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
@@ -256,7 +256,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         ) from None
     except (ValueError, TypeError, AttributeError) as error:
         raise ToftrackError(
-            f"'{path}' is not a track.npz, or it is damaged; give the path of one"
+            f"'{path}' is not a track.npz, or it is damaged ({error}); give the path of one"
         ) from error
     return content
 

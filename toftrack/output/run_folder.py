@@ -17,7 +17,7 @@ from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
 from toftrack.frames.help_text import fields_in_help
 from toftrack.hand.shape import HandShape
-from toftrack.output.lines import HAND_FIELDS
+from toftrack.output.lines import DROPPED, HAND_FIELDS
 from toftrack.output.results import estimates_of, read_results, read_run_facts
 from toftrack.output.summary import shape_file
 from toftrack.pose_space.base import PoseSpace
@@ -310,8 +310,7 @@ def _rows(
             f"'{name}' has {camera.width}x{camera.height} pixels, but the run tracked "
             f"{size.get('width')}x{size.get('height')}; {advice}"
         )
-    times, held = run.results["timestamp_s"], run.results["metadata"].get("held_frames") or ()
-    own = ~np.isin(run.frames, held)
+    times, own = run.results["timestamp_s"], ~run.results[DROPPED]
     late = np.abs(np.asarray(store.timestamp_s)[rows] - times)[own].max()
     if not about.get("repeat") and late > _SAME_TIME_S:
         raise ToftrackError(
