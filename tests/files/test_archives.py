@@ -99,6 +99,13 @@ def test_what_was_made_to_fill_memories_is_not_unpacked(tmp_path: Path) -> None:
     assert "'a': it would unpack" in reported(path)
 
 
+def test_black_images_beside_others_are_read(tmp_path: Path) -> None:
+    black = [header((65, 2**20 // 4)), *[ZEROS] * 65]
+    noise = npy(np.random.default_rng(0).normal(size=10_000))
+    path = save(tmp_path / "a.npz", {"depth": noise, "amplitude": black}, DEFLATED)
+    assert not read_archive(path)["amplitude"].any()
+
+
 def with_more_than_stated(path: Path, method: int) -> Path:
     """The stated size and the header agree, but much more comes."""
     save(path, {"a": [header((1000,)), *[ZEROS] * 128]}, method)

@@ -33,8 +33,8 @@ MOST_BYTES = 2**30
 MOST_TEXT_BYTES = 2**26
 """Nor a text of more than 64 MB, nor so many texts: the names of a day's images take some."""
 _MOST_RATIO, _SMALL_BYTES = 1000, 2**26
-"""What shrank to less than a thousandth was made to fill memories, unless it is small anyway;
-depth and amplitude images of real cameras shrink to a tenth to a fortieth."""
+"""An array of more than a thousand times the archive was made to fill memories, unless it is small
+anyway. Black amplitudes shrink as much; the depth images beside them to a tenth to a fortieth."""
 _MOST_HEADER_BYTES = 2**16
 _PIECE_BYTES = 2**20
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2)
@@ -83,6 +83,7 @@ class Archive:
         with broken_is_value_error():
             if not zipfile.is_zipfile(stream):
                 raise ValueError("it is no .npz archive, or cut off")
+            self._bytes = stream.seek(0, io.SEEK_END)
             stream.seek(0)
             self._stream, self._zip = stream, zipfile.ZipFile(stream)
             self._entries = {
@@ -133,7 +134,7 @@ class Archive:
                 packed = entry.compress_type == zipfile.ZIP_BZIP2
                 stream = bz2.BZ2File(_Packed(self._stream, entry)) if packed else plain
                 header = _header(stream)
-                _check(header, entry)
+                _check(header, entry, self._bytes)
                 yield stream, header
 
 
@@ -257,17 +258,16 @@ def _check_size(size: int, most_bytes: int | None) -> None:
         raise ValueError(f"it is larger than {most / 1e9:.1f} GB")
 
 
-def _check(header: Header, entry: zipfile.ZipInfo) -> None:
+def _check(header: Header, entry: zipfile.ZipInfo, packed: int) -> None:
+    """ValueError for what no array is.  packed: bytes of the archive."""
     if min(header.shape, default=0) < 0 or header.offset + header.size != entry.file_size:
         raise ValueError("it is of another length than its header says")
     # A column of words is long where a run is.
     of_text = header.kind.itemsize, 4 * math.prod(header.shape)
     if header.kind.kind in "US" and max(of_text) > MOST_TEXT_BYTES:
         raise ValueError(f"it is text of {header.size / 1e6:.0f} MB")
-    if entry.file_size > max(_SMALL_BYTES, _MOST_RATIO * entry.compress_size):
-        raise ValueError(
-            f"it would unpack {entry.compress_size} bytes to {entry.file_size / 1e6:.0f} MB"
-        )
+    if entry.file_size > max(_SMALL_BYTES, _MOST_RATIO * packed):
+        raise ValueError(f"it would unpack {packed} bytes to {entry.file_size / 1e6:.0f} MB")
 
 
 def _is_text(array: np.ndarray) -> bool:
