@@ -214,6 +214,16 @@ def test_a_tiff_that_lies_is_refused(tmp_path: Path, content: bytes, words: str)
         opened(tmp_path / "a.tif")
 
 
+def test_an_image_of_a_tiff_is_read_without_those_before_it(tmp_path: Path) -> None:
+    path = tiff(tmp_path / "a.tif", WORDS)
+    stack = opened(path)
+    content = bytearray(path.read_bytes())
+    (first,) = struct.unpack_from("<I", content, 4)
+    content[first : first + 2] = bytes(2)
+    path.write_bytes(content)
+    np.testing.assert_allclose(stack.image(2)[0], METRES[2], rtol=1e-6)
+
+
 def test_what_hdf5_keeps_elsewhere_or_makes_of_nothing_is_not_read(tmp_path: Path) -> None:
     h5 = h5py()
     secret = hdf5(tmp_path / "secret.h5", depth=WORDS)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
 
@@ -74,12 +74,15 @@ def _whole(content: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Page:
-    """What a PNG, or an image of a TIFF, says of itself. kind: `u2` of 16 bits, and so on."""
+    """What a PNG, or an image of a TIFF, says of itself. kind: `u2` of 16 bits, and so on.  at:
+    where in the TIFF its directory is.
+    """
 
     width: int
     height: int
     channels: int
     kind: str
+    at: int = field(default=0, compare=False)
 
     @property
     def is_depth(self) -> bool:
@@ -91,6 +94,11 @@ _TIFF = {b"II": "<", b"MM": ">"}
 _TAGS = {256: 0, 257: 0, 258: 1, 277: 1, 339: 1, 322: 0, 323: 0}
 """Width, height, bits, channels, kind of number, a tile's width and height; and what holds where
 they are not stated."""
+_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
+"""Of a value of each kind that has more than one."""
+_WHOLE = {3: "H", 4: "I", 16: "Q"}
+_PIECES = ((273, 279), (324, 325))
+"""The places and sizes of strips, or tiles."""
 _EXR = b"\x76\x2f\x31\x01"
 _NOTHING_M = 1e10
 """What Blender says where nothing is seen."""
@@ -140,9 +148,65 @@ def _tiff_pages(stream: IO[bytes], head: bytes) -> list[Page]:
         width, height, bits, channels, number, *tile = (_TAGS | stated).values()
         if tile[0] * tile[1] > LARGEST_PIXELS:
             raise ValueError("its tiles are larger than any camera's image")
-        pages[at] = Page(width, height, channels, f"{'?uif'[number % 4]}{bits // 8}")
+        pages[at] = Page(width, height, channels, f"{'?uif'[number % 4]}{bits // 8}", at)
         (at,) = place.unpack(directory[-place.size :])
     return list(pages.values())
+
+
+def tiff_of_page(stream: IO[bytes], at: int) -> bytes:
+    """A TIFF of one image of another, whose directory is there: OpenCV would read all directories
+    before it. Raises ValueError where it is damaged.
+    """
+    size = stream.seek(0, io.SEEK_END)
+    left = 2 * size  # a damaged one may name the same large part many times
+
+    def read(at: int, count: int) -> bytes:
+        nonlocal left
+        left -= count
+        if at + count > size or left < 0:
+            raise ValueError("it is damaged or cut off")
+        stream.seek(at)
+        return stream.read(count)
+
+    head = read(0, 16)
+    order, big = _TIFF[head[:2]], b"+" in head[2:4]
+    place, count = struct.Struct(order + "IQ"[big]), struct.Struct(order + "HQ"[big])
+    entry = struct.Struct(order + ("HHQ8s" if big else "HHI4s"))
+    made = bytearray(head[: 16 if big else 8])
+    (entries,) = count.unpack(read(at, count.size))
+    values: dict[int, tuple[int, int, bytes]] = {}
+    for tag, kind, many, value in entry.iter_unpack(read(at + count.size, entries * entry.size)):
+        length = many * _BYTES.get(kind, 1)
+        if length > place.size:
+            value = read(place.unpack(value)[0], length)
+        values[tag] = kind, many, value
+    for of_places, of_sizes in _PIECES:
+        if of_places in values and of_sizes in values:
+            moved = []
+            places, sizes = (_numbers(order, *values[tag]) for tag in (of_places, of_sizes))
+            for piece in zip(places, sizes, strict=True):
+                moved.append(len(made))
+                made += read(*piece)
+            kind, letter = (16, "Q") if big else (4, "I")
+            values[of_places] = (
+                kind,
+                len(moved),
+                struct.pack(f"{order}{len(moved)}{letter}", *moved),
+            )
+    directory = count.pack(len(values))
+    for tag, (kind, many, value) in values.items():
+        if len(value) > place.size:
+            made += bytes(len(made) % 2)
+            value, rest = place.pack(len(made)), value
+            made += rest
+        directory += entry.pack(tag, kind, many, value)
+    made += bytes(len(made) % 2)
+    place.pack_into(made, 8 if big else 4, len(made))
+    return bytes(made + directory + place.pack(0))
+
+
+def _numbers(order: str, kind: int, many: int, value: bytes) -> tuple[int, ...]:
+    return struct.unpack_from(f"{order}{many}{_WHOLE.get(kind, 'I')}", value)
 
 
 def decoded_depth(content: bytes) -> np.ndarray:

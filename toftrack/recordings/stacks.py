@@ -27,7 +27,7 @@ from toftrack.recordings.bare import (
     size_of,
 )
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
-from toftrack.recordings.images import pages_of
+from toftrack.recordings.images import pages_of, tiff_of_page
 from toftrack.recordings.matlab import matlab_variables, read_matlab
 
 _PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
@@ -137,15 +137,17 @@ class _Tiff:
             pages = pages_of(stream)
             if not pages or not pages[0].is_depth or len(set(pages)) > 1:
                 raise ValueError("its images are not grey, of one size, and of 16 bits or floats")
-        self._path = path
+        self._path, self._places = path, [page.at for page in pages]
         self.shape = (len(pages), pages[0].height, pages[0].width)
         self.dtype = np.dtype(pages[0].kind)
 
     def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
-        _, found = cv2.imreadmulti(str(self._path), int(at[0]), 1, flags=cv2.IMREAD_UNCHANGED)
-        if len(found) != 1 or found[0].shape != self.shape[1:]:
+        with open_to_read(self._path) as stream:
+            content = tiff_of_page(stream, self._places[int(at[0])])
+        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        if found is None or found.shape != self.shape[1:]:
             raise ValueError("OpenCV cannot decode it")
-        return found[0]
+        return found
 
 
 def _chosen(path: Path, wanted: str | None, there: dict[str, tuple[int, ...]]) -> str:
