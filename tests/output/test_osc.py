@@ -61,6 +61,12 @@ def test_of_a_lost_hand_nothing_is_sent_but_that(receiver: socket.socket) -> Non
     assert set(sent(receiver, gone)) == {"/toftrack/frame", "/toftrack/right/tracked"}
 
 
+def test_a_frame_number_beyond_32_bits_is_sent_without_what_is_beyond(
+    receiver: socket.socket,
+) -> None:
+    assert sent(receiver, replace(lost_hand(2), index=2**31 + 5))["/toftrack/frame"][0] == 5
+
+
 def test_hands_of_several_persons_have_the_numbers_of_their_slots(receiver: socket.socket) -> None:
     host, port = receiver.getsockname()
     right, left, vacant = (

@@ -80,10 +80,11 @@ def messages(line: dict[str, Any], parts: Sequence[str], numbered: bool) -> Iter
 
     numbered: addresses have the slots' numbers, as of several persons some hands are of one side.
     """
-    yield "/toftrack/frame", [("i", line["index"]), ("d", line["timestamp_s"])]
+    number = line["index"] % 2**31  # a camera's may be a clock's
+    yield "/toftrack/frame", [("i", number), ("d", line["timestamp_s"])]
     for hand in hands_of(line):
-        number = f"_{hand['slot'] + 1}" if numbered else ""
-        yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}{number}", parts)
+        slot = f"_{hand['slot'] + 1}" if numbered else ""
+        yield from _messages_of(hand, f"/toftrack/{hand['side'] or 'hand'}{slot}", parts)
 
 
 def _messages_of(hand: dict[str, Any], root: str, parts: Sequence[str]) -> Iterator[Message]:
