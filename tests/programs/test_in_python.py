@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from helpers.tracking import Camera, run, sample
 
 import toftrack
 from toftrack.devices.replay import Sample
+from toftrack.output.lines import KINDS
 from toftrack.programs import in_python
 from toftrack.programs.recover import recover
 from toftrack.recordings.npz import read_recording
@@ -56,6 +58,22 @@ def test_the_estimates_and_results_are_those_of_the_command_line(
     assert all(hasattr(results, name) for name in dir(results)), "what completion offers is there"
     with pytest.raises(AttributeError, match="no array 'joint_m'; it has index, .*joints_m"):
         _ = results.joint_m
+
+
+@pytest.mark.parametrize("kind", ["csv", "jsonl"])
+def test_a_long_table_is_not_made_in_memory(
+    results: toftrack.Results, tmp_path: Path, kind: str
+) -> None:
+    of_frames = {*KINDS, "dropped"}
+    many = {
+        name: np.repeat(value, 100, 0) if name in of_frames else value
+        for name, value in results.content.items()
+    }
+    tracemalloc.start()
+    toftrack.Results(many).save(path := tmp_path / f"hand.{kind}")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < path.stat().st_size / 2
 
 
 def test_results_are_saved_as_a_run_saves_them(results: toftrack.Results, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 import io
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from toftrack.errors import reported_errors
-from toftrack.files.safe_files import write_whole
+from toftrack.files.safe_files import whole_file
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES, OPENXR_PARENTS
 from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports import HandMotion, glb_of, motions_of
@@ -47,24 +47,26 @@ def export(folder: Path, kind: str) -> list[Path]:
     Raises ToftrackError: the folder is no run's, or has no hand; or the file cannot be written.
     """
     run = read_run(folder)
+    contents: dict[str, Iterable[bytes]]
     if kind == "csv":
-        contents = {"hand.csv": csv_of(run.results).encode()}
+        contents = {"hand.csv": csv_lines(run.results)}
     else:
         motions = motions_of(run.results, run.shapes)
         if kind == "glb":
-            contents = {"hand.glb": glb_of(motions)}
+            contents = {"hand.glb": [glb_of(motions)]}
         else:  # a file has one skeleton
             steps_s = np.diff(motions[0].time_s)
             if len(steps_s) and steps_s.max() > 1.5 * np.median(steps_s):
                 print(
                     "note: frames are not evenly spaced, which a .bvh cannot say", file=sys.stderr
                 )
-            slots = {motion.slot: bvh_of(motion).encode() for motion in motions}
+            slots = {motion.slot: [bvh_of(motion).encode()] for motion in motions}
             several = len(run.shapes) > 1
             contents = {f"hand{slot + 1 if several else ''}.bvh": c for slot, c in slots.items()}
     with reported_errors(f"'{folder}' cannot be written", "copy it to where it can be"):
         for name, content in contents.items():
-            write_whole(folder / name, content)
+            with whole_file(folder / name) as stream:
+                stream.writelines(content)
     return [folder / name for name in contents]
 
 
@@ -120,22 +122,23 @@ _PLAIN = (
 _MAIN_AXES = ("ray", "along", "across")  # of hand/regions.py
 
 
-def csv_of(results: Mapping[str, Any]) -> str:
-    """The content of a .csv file: a row a frame, or a frame and hand where there are several.
+def csv_lines(results: Mapping[str, Any]) -> Iterator[bytes]:
+    """The lines of a .csv file: titles, and a row a frame, or a frame and hand where there are
+    several.
 
     What is unknown (NaN) is an empty cell. results: of a track.npz.
     """
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
     rows = table_of(results)
-    table.writerow(next(rows))
-    for number, time_s, *values in rows:
-        table.writerow([number, f"{time_s:.6f}", *map(_cell, values)])
-    return text.getvalue()
+    titles = next(rows)
+    cells = ([number, f"{time_s:.6f}", *map(_cell, rest)] for number, time_s, *rest in rows)
+    for row in chain([titles], cells):
+        text = io.StringIO()
+        csv.writer(text, lineterminator="\n").writerow(row)
+        yield text.getvalue().encode()
 
 
 def table_of(results: Mapping[str, Any]) -> Iterator[list[Any]]:
-    """The titles of `csv_of`, and then its rows, with their values as they are."""
+    """The titles of `csv_lines`, and then its rows, with their values as they are."""
     several = np.ndim(results["lost"]) > 1
     slots = np.shape(results["lost"])[1] if several else 1
     joints = results["joint_names"]

@@ -24,7 +24,7 @@ from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import BaseDevice, frames_of
 from toftrack.errors import ToftrackError, module_of_extra, reported_errors
 from toftrack.files.archives import write_archive
-from toftrack.files.safe_files import write_whole
+from toftrack.files.safe_files import whole_file
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import KINDS, json_line
@@ -32,7 +32,7 @@ from toftrack.output.records import facts_for_readers
 from toftrack.output.results import ResultWriter, UnwritableError, estimates_of, read_results
 from toftrack.output.stream import ReaderGoneError
 from toftrack.programs.applications import with_recording
-from toftrack.programs.export import csv_of, table_of
+from toftrack.programs.export import csv_lines, table_of
 
 if TYPE_CHECKING:
     import pandas
@@ -209,10 +209,13 @@ class Results:
                 texts = {"metadata": np.array(json.dumps(content["metadata"]))}
                 write_archive(path, content | texts | facts_for_readers(content["metadata"]))
             elif path.suffix == ".csv":
-                write_whole(path, csv_of(content))
+                with whole_file(path) as stream:
+                    stream.writelines(csv_lines(content))
             elif path.suffix == ".jsonl":
                 rows = np.flatnonzero(~self.dropped).tolist()
-                write_whole(path, "".join(f"{json_line(self.estimates(row))}\n" for row in rows))
+                lines = (f"{json_line(self.estimates(row))}\n".encode() for row in rows)
+                with whole_file(path) as stream:
+                    stream.writelines(lines)
             else:
                 raise ToftrackError(f"'{path}' names no format; let it end in .npz, .jsonl or .csv")
 
