@@ -106,6 +106,12 @@ def test_a_file_is_there_as_a_whole_or_as_it_was(path: Path) -> None:
     assert stat.S_IMODE(path.stat().st_mode) == usual
 
 
+def test_a_name_as_long_as_the_system_allows_is_written(tmp_path: Path) -> None:
+    path = tmp_path / ("手" * 84)
+    write_whole(path, "new")
+    assert path.read_text() == "new" and list(tmp_path.iterdir()) == [path]
+
+
 def test_two_who_write_a_file_at_once_do_not_meet(path: Path) -> None:
     with whole_file(path) as one, whole_file(path) as other:
         one.write(b"one")

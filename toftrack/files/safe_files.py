@@ -201,7 +201,8 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
     """
     path = Path(path)
     check_replaceable(path)
-    partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}{_PARTIAL}")
+    # Of a long name the beginning: the whole one leaves no room for an ending.
+    partial = path.with_name(f"{path.name[:50]}.{secrets.token_hex(4)}{_PARTIAL}")
     stream = open_new(partial)
     try:
         with stream:
