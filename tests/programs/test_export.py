@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from pathlib import Path
 
 import numpy as np
@@ -85,7 +86,7 @@ def test_a_bvh_has_the_skeleton_of_a_hand_that_was_there(
     for path, side in zip(made, slots.values(), strict=True):
         text = path.read_text()
         names, places = read_bvh(text)
-        assert f"Frames: {FRAMES}\nFrame Time: 0.040000\n" in text
+        assert f"Frames: {FRAMES}\nFrame Time: 0.040000000\n" in text
         assert len(names) == 25 and names[0] == f"Wrist_{side[0].upper()}"
         assert len(places) == FRAMES and np.allclose(places[[MISSED]], places[3])
         for frame in (0, FRAMES - 1):
@@ -93,6 +94,16 @@ def test_a_bvh_has_the_skeleton_of_a_hand_that_was_there(
             assert np.allclose(places[frame, -1], there[0], atol=0.001)  # the root ends last
             away = np.linalg.norm(places[frame] - there[:, None], axis=-1)
             assert away.min(1).max() < 0.01  # every joint is somewhere
+
+
+def test_a_bvh_lasts_as_long_as_frames_whose_times_are_whole_milliseconds(tmp_path: Path) -> None:
+    default_hand_shape().save(tmp_path / shape_file(0))
+    with ResultWriter(tmp_path, {"config": {}}, JOINT_NAMES) as results:
+        for index in range(31):
+            results.append((estimate(index, "right").updated(timestamp_s=round(index / 30, 3)),))
+    text = export.export(tmp_path, "bvh")[0].read_text()
+    (seconds,) = re.findall(r"Frame Time: (\S+)", text)
+    assert float(seconds) == pytest.approx(1 / 30, abs=1e-8)
 
 
 @pytest.mark.parametrize("sides", SLOTS)
