@@ -150,6 +150,7 @@ def test_frames_are_shown_about_the_hand_with_what_the_tracker_says() -> None:
     device, config = Sample(stop=8), configuration("filter.particles=100", "hand.side=right")
     known = track(device, config)
     assert known.confidence.shape == (8,) and known.confidence[-1] > 0.5
+    assert sum(part.nbytes for part in known) < 8 * 300  # an hour has 100 000 frames
     frames = label_frames(device, config, [0, 7], known)
     assert [frame.number for frame in frames] == [0, 7]
     last = frames[-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,7 +25,6 @@ from toftrack.evaluation.image_labels import Points, parsed_labels
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
 from toftrack.frames.camera import Camera
-from toftrack.frames.estimate import Estimate
 from toftrack.hand.skeleton import FINGERS
 
 TIPS = tuple(f"{finger}_tip" for finger in FINGERS)
@@ -74,10 +73,11 @@ def chosen_frames(
 class Tracked(NamedTuple):
     """What the tracker says of T frames.
 
+    joints_m: (T, 21, 3), NaN where the hand is lost.
     confidence: (T,), 0 where the hand is lost; 1 where nobody finds one, so that such come last.
     """
 
-    estimates: Sequence[Estimate]
+    joints_m: np.ndarray
     confidence: np.ndarray
 
 
@@ -85,17 +85,17 @@ def track(device: Device, config: DictConfig) -> Tracked:
     """Track all of a recording, with a configuration of one hand. Raises ToftrackError."""
     with one_sentence():
         tracker, detector = build_tracker(config), instantiate(config.detector)
-    camera, estimates, confidence = device.camera, [], []
+    camera, joints, confidence = device.camera, [], []
     for frame in tqdm(device, total=device.frames, unit=" frames", file=sys.stderr):
         depth_m = camera.rectify(frame.depth, frame.radial)
         estimate = tracker.step(depth_m, camera.K, frame.index, frame.timestamp_s)
-        estimates.append(estimate)
+        joints.append(np.where(estimate.lost, np.float32(np.nan), estimate.joints_m))
         if not estimate.lost:
             confidence.append(float(np.nan_to_num(estimate.confidence)))
         else:
             nobody = detector is not None and _found(detector, depth_m, camera.K) is None
             confidence.append(float(nobody))
-    return Tracked(estimates, np.array(confidence))
+    return Tracked(np.array(joints), np.array(confidence))
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,10 +135,12 @@ def label_frames(
             )
         if row in numbers:
             depth_m = camera.rectify(frame.depth, frame.radial)
-            estimate = None if known is None or known.estimates[row].lost else known.estimates[row]
-            seen = _found(detector, depth_m, camera.K) if estimate is None else estimate.joints_m
+            joints = None if known is None else known.joints_m[row]
+            if joints is not None and np.isnan(joints).any():
+                joints = None
+            seen = _found(detector, depth_m, camera.K) if joints is None else joints
             depth_mm = np.clip(1e3 * depth_m + 0.5, 0, 65535).astype("<u2")
-            pixels = None if estimate is None else camera.project(estimate.joints_m)
+            pixels = None if joints is None else camera.project(joints)
             shown.append(LabelFrame(row, depth_mm, *_about(seen, depth_m, camera), pixels))
         if len(shown) == len(numbers):
             break
