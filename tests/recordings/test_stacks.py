@@ -214,6 +214,24 @@ def test_a_tiff_that_lies_is_refused(tmp_path: Path, content: bytes, words: str)
         opened(tmp_path / "a.tif")
 
 
+def test_a_chunk_of_hdf5_is_unpacked_once_for_all_its_images(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stack = opened(hdf5(tmp_path / "a.h5", depth=WORDS))
+    reads: list[Any] = []
+    kind = h5py().Dataset
+    read = kind.__getitem__
+
+    def counted(dataset: Any, at: Any) -> Any:
+        reads.append(at)
+        return read(dataset, at)
+
+    monkeypatch.setattr(kind, "__getitem__", counted)
+    for number in range(COUNT):
+        np.testing.assert_allclose(stack.image(number)[0], METRES[number], rtol=1e-6)
+    assert len(reads) <= 1
+
+
 def test_an_image_of_a_tiff_is_read_without_those_before_it(tmp_path: Path) -> None:
     path = tiff(tmp_path / "a.tif", WORDS)
     stack = opened(path)

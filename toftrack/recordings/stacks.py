@@ -164,11 +164,17 @@ def _chosen(path: Path, wanted: str | None, there: dict[str, tuple[int, ...]]) -
 
 
 class _Hdf5:
-    """A dataset of an HDF5 file, as an array of three axes; it is opened when it is needed."""
+    """A dataset of an HDF5 file, as an array of three axes; it is opened when it is needed.
+
+    A chunk holds a part of many images, the more the longer the stack is, and is unpacked as a
+    whole: as many images are read at a time.
+    """
 
     def __init__(self, path: Path, wanted: str | None) -> None:
         self._h5py: Any = module_of_extra("h5py", f"'{path}' is read by h5py", "hdf5")
         self._path, self._file = path, None
+        self._latest: tuple[tuple[int, int], np.ndarray] | None = None
+        """Which axis, of what number on; and what was read there."""
         there: dict[str, Any] = {}
 
         def note(name: str, found: Any) -> None:
@@ -196,12 +202,23 @@ class _Hdf5:
         if self._file is None:
             self._file = self._h5py.File(self._path, "r")
         found = self._file[self._name]
-        return found[at[-found.ndim :]]
+        if found.ndim < 3 or found.chunks is None:
+            return found[at[-found.ndim :]]
+        axis = next(axis for axis, one in enumerate(at) if not isinstance(one, slice))
+        image_bytes = found.nbytes // found.shape[axis]
+        count = max(1, min(found.chunks[axis], _SMALL_BYTES // image_bytes))
+        row = int(at[axis]) % count
+        here = axis, int(at[axis]) - row
+        if self._latest is None or self._latest[0] != here:
+            some = [slice(None)] * 3
+            some[axis] = slice(here[1], here[1] + count)
+            self._latest = here, found[tuple(some)]
+        return self._latest[1].take(row, axis)
 
     def close(self) -> None:
         if self._file is not None:
             self._file.close()
-        self._file = None
+        self._file = self._latest = None
 
 
 def _hdf5(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
