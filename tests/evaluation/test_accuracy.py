@@ -1,5 +1,6 @@
 """`toftrack benchmark accuracy` and `ablation`: what they measure, write and refuse."""
 
+import gc
 import json
 
 import cv2
@@ -9,8 +10,10 @@ from helpers.tracking import ROOT
 from omegaconf import OmegaConf
 
 from toftrack.configuration.compose import configuration
+from toftrack.devices.replay import Sample
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import accuracy, results, runs
+from toftrack.frames.estimate import Estimate
 from toftrack.programs import benchmark
 
 QUICK = ("experiment=paper", "filter.particles=30")
@@ -85,6 +88,15 @@ def test_figures_depend_neither_on_processes_nor_on_threads(folder) -> None:
         timeless = [{k: v for k, v in row.items() if not k.endswith("_ms")} for row in rows]
         results.append(sorted(timeless, key=lambda row: row["recording"]))
     assert results[0] == results[1]
+
+
+def test_of_frames_that_are_measured_no_estimates_are_kept() -> None:
+    def estimates() -> int:
+        return sum(isinstance(one, Estimate) for one in gc.get_objects())
+
+    before, job = estimates(), runs.Job(runs.Source(ROOT, "", 12), 0)
+    reported, _ = runs._tracked(Sample(stop=12), job, "right")
+    assert len(reported) == 12 and estimates() - before < 6
 
 
 def test_labelled_images_are_measured_too(folder, tmp_path, capsys) -> None:

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from toftrack.api import make_tracker
 from toftrack.evaluation.datasets import FPS, DataSet, LabelledSequence
 from toftrack.evaluation.results import plain, table_of
-from toftrack.evaluation.runs import estimates_of
+from toftrack.evaluation.runs import estimates_of, kept
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
 from toftrack.frames.frame import Truth
@@ -62,7 +62,7 @@ def evaluate(
             reported = []
             for index in range(count):
                 depth_m, time_s = sequence.frame(index), index / FPS
-                reported.append([tracker.step(depth_m, sequence.camera.K, index, time_s)])
+                reported.append([kept(tracker.step(depth_m, sequence.camera.K, index, time_s))])
                 bar.update()
             found = estimates_of(reported)
             joints = tips_inset(found.joints_m, tip_inset_m)[:, list(data_set.joints)]

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,20 @@ _FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
 """What estimates are measured by; a peer's have the first two alone."""
 _SIDE_FIELDS = ("side", "side_probability")
 """What is measured besides where the side is found out."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Kept:
+    """Fields of an Estimate that are measured, a tenth of it."""
+
+    joints_m: np.ndarray
+    lost: bool
+    joint_sigma_m: np.ndarray
+    joint_ok: np.ndarray
+    gesture: str
+    side: str
+    side_probability: float
+    compute_s: float
 
 
 @dataclass(frozen=True)
@@ -219,7 +233,7 @@ def _row(
     job: Job,
     device: Replay,
     truth: Truth,
-    reported: Sequence[Sequence[Estimate | PeerEstimate]],
+    reported: Sequence[Sequence[Kept | PeerEstimate]],
 ) -> Row:
     track = estimates_of(reported, with_side=job.side == "auto")
     compute_s = np.array([frame[0].compute_s for frame in reported])
@@ -241,25 +255,31 @@ def _row(
 
 def _tracked(
     device: Replay, job: Job, side: str
-) -> tuple[list[tuple[Estimate, ...]], list[PeerEstimate]]:
+) -> tuple[list[tuple[Kept, ...]], list[PeerEstimate]]:
     """What the tracker says of each frame, and what the peer, if there is one, says after it."""
     peer = None if job.peer is None else peer_process(job.peer)
     if peer is not None:
         peer.begin(device.camera, side if job.side == "told" else "")
     tracker = _tracker(job, side)
-    reported: list[tuple[Estimate, ...]] = []
+    reported: list[tuple[Kept, ...]] = []
     others: list[PeerEstimate] = []
     for frame in device:
         depth = device.camera.rectify(frame.depth, frame.radial)
-        reported.append(tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s))
+        said = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
+        reported.append(tuple(map(kept, said)))
         if peer is not None:
             assert frame.amplitude is not None
             others.append(peer.step(depth, frame.amplitude))
     return reported, others
 
 
+def kept(estimate: Estimate) -> Kept:
+    """What is kept of an estimate of a recording's frame."""
+    return Kept(**{field.name: getattr(estimate, field.name) for field in fields(Kept)})
+
+
 def estimates_of(
-    reported: Sequence[Sequence[Estimate | PeerEstimate]], with_side: bool = False
+    reported: Sequence[Sequence[Kept | PeerEstimate]], with_side: bool = False
 ) -> Estimates:
     """What was said in T frames of each slot, by those fields of Estimates that the reported ones
     have, with the side where it was found out; with one slot without its axis."""
@@ -293,7 +313,7 @@ def _stills(job: Job, device: Replay, labels: Stills) -> Iterator[tuple[int, Row
         yield number, {"kind": "stills", "shown": shown, "gesture": reported[0].gesture, **figures}
 
 
-def _expect_one_hand(reported: Sequence[Estimate]) -> None:
+def _expect_one_hand(reported: Sequence[object]) -> None:
     if len(reported) != 1:
         raise ToftrackError("labelled images are of one hand; leave out --hands")
 
