@@ -297,9 +297,11 @@ def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize(("most_bytes", "waiting"), [(2**28, 32), (1, 2)])
 def test_a_live_run_does_not_wait_for_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_bytes: int, waiting: int
 ) -> None:
+    monkeypatch.setattr(module, "_WAITING_BYTES", most_bytes)
     held = threading.Event()
     append = module.UnfinishedRecording.append
 
@@ -308,12 +310,12 @@ def test_a_live_run_does_not_wait_for_the_disk(
         append(*arguments)
 
     monkeypatch.setattr(module.UnfinishedRecording, "append", slow)
-    many = 2 * module._WAITING
+    many = 2 * waiting
     with Recorder(tmp_path / "hand.npz", Images(), 1.0) as recorder:
         for _ in range(many):
             recorder.put(one_frame(), wait=False)
         held.set()
-    assert recorder.missed >= many - module._WAITING - 1
+    assert recorder.missed >= many - waiting - 1 > 0
     assert recorder.frames + recorder.missed == many
     assert f"{recorder.missed} more came too fast" in recorder.words()
 

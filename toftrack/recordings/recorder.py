@@ -38,6 +38,8 @@ from toftrack.recordings.unfinished import (
 
 _WAITING = 32
 """Frames at most that are not written yet, 1.8 MB each at 640 x 480."""
+_WAITING_BYTES = 2**28
+"""So much of them at most, or two: of 12 million pixels 32 would take 2.4 GB."""
 _SPARE_BYTES = 2**27
 """So much of the disk is left to others: a recording must not end the run that it is of."""
 _GIGABYTE = 1e9
@@ -101,6 +103,8 @@ class Recorder:
         # Copies: whose memory the images are in, may use it again.
         amplitude = None if frame.amplitude is None else np.array(frame.amplitude)
         kept = replace(frame, depth=np.array(frame.depth), amplitude=amplitude)
+        size = kept.depth.nbytes + (0 if amplitude is None else amplitude.nbytes)
+        self._queue.maxsize = max(2, min(_WAITING, _WAITING_BYTES // max(1, size)))
         try:
             self._queue.put(kept, block=wait)
         except queue.Full:
