@@ -41,6 +41,7 @@ class Images(BaseDevice):
     def __init__(self, camera: Camera | None = None, radial: bool = False) -> None:
         super().__init__(camera or Camera(K, WIDTH, HEIGHT), 30.0)
         self.description |= {"serial": "1234", "recording": "/home/me/hand.bag", "size": [1, 2]}
+        self.description["files"] = ["depth_1.png"]
         self.metadata = {"hand_length_mm": 180.5}
         self._radial = radial
 

@@ -205,11 +205,12 @@ class Recorder:
                 raise wrong_unit(f"the depth of the first {_STRANGE} frames", frame.depth)
 
     def _facts_of(self, frame: Frame) -> Facts:
-        # As a device's facts may be given away: no serial number, no folders.
+        # As a device's facts may be given away: no serial number, no folders, nor their files, of
+        # which there are as many as frames.
         device = {
             key: Path(value).name if isinstance(value, str | Path) else value
             for key, value in self._source.description.items()
-            if "serial" not in key.lower()
+            if "serial" not in key.lower() and key != "files"
         }
         about = {"toftrack": version("toftrack"), "device": device}
         metadata = {**self._source.metadata, "recorded": about}
