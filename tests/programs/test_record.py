@@ -21,6 +21,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.frame import Frame
 from toftrack.programs import command_line, recover
 from toftrack.programs.record import main, record_frames
+from toftrack.recordings import recorder
 from toftrack.recordings.npz import read_recording
 from toftrack.recordings.recorder import Recorder
 
@@ -171,6 +172,18 @@ def test_at_the_limit_the_command_ends_well(
         assert f"{path}: " in reported.out
         assert 0.0004e9 <= path.stat().st_size < 0.0008e9
         assert Replay(path).frames > 2
+
+
+def test_who_says_how_many_frames_gets_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorder, "_GIGABYTE", 1e5)  # the default is reached by the second frame
+    path = tmp_path / "a.npz"
+    settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
+    assert record(str(path), *settings, "--frames", "9") == 0
+    assert Replay(path).frames == 9
+    assert record(str(path), *settings, "--frames", "9", "record_limit_gb=1", "--overwrite") == 0
+    assert Replay(path).frames < 9
 
 
 @pytest.mark.parametrize(

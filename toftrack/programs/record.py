@@ -9,6 +9,7 @@ full, `toftrack recover OUT.npz` makes the file from the frames that came until 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Sequence
@@ -40,7 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("out", metavar="OUT", help="the new recording, .npz or .srs")
     add("--frames", type=int, help="stop after this many (default: at Ctrl-C)")
     add("--seconds", type=float, help="stop after this time")
-    add("--limit", type=float, metavar="GB", help="stop at this size (default: 1)")
+    about = "stop at this size (default: 1, none with --frames or --seconds)"
+    add("--limit", type=float, metavar="GB", help=about)
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--conf", default=folder, help="folder of the configuration")
     add("--config-dir", help="folder of choices of your own")
@@ -59,7 +61,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         )
     config = _configuration(options, raw=suffix == ".srs")
     if options.limit is None:
-        options.limit = config.record_limit_gb
+        wanted = options.frames or options.seconds  # which a default must not cut short
+        chosen = any(word.startswith("record_limit_gb=") for word in options.overrides)
+        options.limit = math.inf if wanted and not chosen else config.record_limit_gb
     with one_sentence():
         device: Device = instantiate(config.device)
     if suffix == ".npz":
