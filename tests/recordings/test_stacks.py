@@ -284,6 +284,8 @@ def test_images_in_a_cell_are_told_from_what_lies_beside_them(
     path = mat(tmp_path / "a.mat", frames=cell, boxes=np.ones((2, 4)))
     with pytest.raises(ToftrackError, match=r"cat\(3, frames{:}\)"):
         opened(path, dataset)
+    path = mat(tmp_path / "b.mat", depth=np.ones((64, 80), np.float32), labels=cell)
+    assert len(opened(path)) == 1, "a single image has its labels in a cell"
 
 
 def test_whole_numbers_of_a_mat_file_count_by_their_own_size(

@@ -34,6 +34,8 @@ _PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
 """Which axes are frames, rows and columns; the last is MATLAB's as HDF5 sees it."""
 _NUMBERS = ("double", "single", *(f"{s}int{n}" for s in ("", "u") for n in (8, 16, 32, 64)))
 """MATLAB's classes of numbers."""
+_LEAST_PX = 64
+"""Of a side of an image; what is narrower, beside a cell, may be boxes or joints of each frame."""
 _MOST_NESTED = 32
 """Groups of HDF5: each is looked up from the first one on."""
 _MOST_RATIO, _SMALL_BYTES, _MOST_CHUNK_BYTES = 1000, 2**26, 2**28
@@ -236,15 +238,15 @@ def _mat(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
             for name, (shape, kind) in variables.items()
             if kind in _NUMBERS and len(shape) in (2, 3) and min(shape) > 0 and max(shape) > 1
         }
-        stacked = any(len(shape) == 3 for shape in there.values())
+        images = any(len(shape) == 3 or min(shape) >= _LEAST_PX for shape in there.values())
         for name, (_, kind) in variables.items():
-            if kind == "cell" and (name == wanted or (wanted is None and not stacked)):
+            if kind == "cell" and (name == wanted or (wanted is None and not images)):
                 raise ToftrackError(
-                    f"'{path}' has its images in a cell, which is not read; save them as one "
-                    f"array, cat(3, {name}{{:}}), and give that"
+                    f"'{path}': {name} is a cell, which is not read; save its images as one array, "
+                    f"cat(3, {name}{{:}}), and give that"
                 )
-        images = read_matlab(path, _chosen(path, wanted, there))
-    return (images[None], _PYTHONS) if images.ndim == 2 else (images, _MATLABS)
+        array = read_matlab(path, _chosen(path, wanted, there))
+    return (array[None], _PYTHONS) if array.ndim == 2 else (array, _MATLABS)
 
 
 _OPENED = {
