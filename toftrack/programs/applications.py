@@ -103,7 +103,7 @@ def _line_to_complete(line: str) -> str:
     """
     *words, last = line.split(" ")
     settings = (word for word in words if "=" in word and word[0] != "-" or word == "-m")
-    return " ".join(["toftrack", *options_first([*settings]), last])
+    return " ".join(["toftrack", *options_first([*settings]), last if last[:1] != "-" else ""])
 
 
 def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> list[str]:

@@ -90,8 +90,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     if given[0] == "-sc" and (line := os.environ.get("COMP_LINE")):  # a shell completes this
         given = [*line.split()[1:2], *given]
-        if given[0] not in _LONG_HELP or line.count(" ") < 2:
+        if line.count(" ") < 2:
             say(" ".join(_COMMANDS), sys.stdout)
+        if line.count(" ") < 2 or given[0] not in _LONG_HELP:  # of others the shell offers files
             return 0
     name, rest = given[0], given[1:]
     if name == _VERSION or (name in _COMMANDS and _VERSION in rest):
