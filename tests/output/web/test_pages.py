@@ -134,6 +134,8 @@ def test_a_drag_turns_the_hand_also_where_the_browser_tells_no_movement(
     before = page.execute_script("return turn[0]")
     canvas = page.find_element("tag name", "canvas")
     ActionChains(page).click_and_hold(canvas).move_by_offset(100, 0).release().perform()
+    elsewhere = page.find_element("id", "mirror")
+    ActionChains(page).click_and_hold(elsewhere).move_to_element(canvas).release().perform()
     assert page.execute_script("return turn[0]") == pytest.approx(before - 0.8, abs=0.02)
 
 
