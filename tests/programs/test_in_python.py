@@ -181,6 +181,7 @@ def test_what_cannot_be_tracked_is_one_clear_sentence(tmp_path: Path) -> None:
             toftrack.track(*words)
     with pytest.raises(toftrack.ToftrackError, match="was given ndarray"):
         toftrack.PushDevice(np.eye(3))
+    assert toftrack.BaseDevice(None).camera is None, "a device may know it only when it is open"
 
 
 def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:

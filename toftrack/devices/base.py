@@ -28,7 +28,7 @@ class BaseDevice:
         live: bool = False,
     ) -> None:
         check_number("fps", fps, 0, above=True)
-        if not isinstance(camera, Camera):
+        if not isinstance(camera, Camera | None):  # None: `open` will set it
             kind = type(camera).__name__
             raise ToftrackError(f"a device needs Camera(K, width, height), but was given {kind}")
         self.camera = camera
