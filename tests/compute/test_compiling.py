@@ -28,8 +28,9 @@ def _times_factor(value):
 
 
 @pytest.fixture(autouse=True)
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog) -> Iterator[Path]:
     """Of the kernels, which is empty; and nothing has been said yet."""
+    caplog.set_level("WARNING")  # runs of other tests in this process leave INFO
     monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
     monkeypatch.setattr(compiling, "_said", set())
     yield tmp_path / "toftrack" / "kernels"
