@@ -242,6 +242,14 @@ def test_an_image_of_a_tiff_is_read_without_those_before_it(tmp_path: Path) -> N
     np.testing.assert_allclose(stack.image(2)[0], METRES[2], rtol=1e-6)
 
 
+def test_a_tiff_without_the_sizes_of_its_strips_is_read(tmp_path: Path) -> None:
+    content = tiff(tmp_path / "a.tif", WORDS).read_bytes()
+    sizes = struct.pack("<HHI", 279, 4, 1)
+    assert content.count(sizes) == COUNT
+    (tmp_path / "a.tif").write_bytes(content.replace(sizes, struct.pack("<HHI", 280, 4, 1)))
+    np.testing.assert_allclose(opened(tmp_path / "a.tif").image(2)[0], METRES[2], rtol=1e-6)
+
+
 def test_what_hdf5_keeps_elsewhere_or_makes_of_nothing_is_not_read(tmp_path: Path) -> None:
     h5 = h5py()
     secret = hdf5(tmp_path / "secret.h5", depth=WORDS)

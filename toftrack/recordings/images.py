@@ -74,8 +74,9 @@ def _whole(content: bytes) -> bool:
 
 @dataclass(frozen=True)
 class Page:
-    """What a PNG, or an image of a TIFF, says of itself. kind: `u2` of 16 bits, and so on.  at:
-    where in the TIFF its directory is.
+    """What a PNG, or an image of a TIFF, says of itself. kind: `u2` of 16 bits, and so on.
+
+    at: where in the TIFF its directory is.
     """
 
     width: int
@@ -94,11 +95,10 @@ _TIFF = {b"II": "<", b"MM": ">"}
 _TAGS = {256: 0, 257: 0, 258: 1, 277: 1, 339: 1, 322: 0, 323: 0}
 """Width, height, bits, channels, kind of number, a tile's width and height; and what holds where
 they are not stated."""
-_BYTES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8, 13: 4, 16: 8, 17: 8, 18: 8}
-"""Of a value of each kind that has more than one."""
-_WHOLE = {3: "H", 4: "I", 16: "Q"}
-_PIECES = ((273, 279), (324, 325))
-"""The places and sizes of strips, or tiles."""
+_NUMBERS = {3: "H", 4: "I", 16: "Q"}
+"""The kinds of values that decoders need of an image of 16 bits or floats."""
+_PLACES, _SIZES = (273, 324), (279, 325)
+"""Of strips, of tiles."""
 _EXR = b"\x76\x2f\x31\x01"
 _NOTHING_M = 1e10
 """What Blender says where nothing is seen."""
@@ -127,11 +127,9 @@ def pages_of(stream: IO[bytes]) -> list[Page]:
 
 def _tiff_pages(stream: IO[bytes], head: bytes) -> list[Page]:
     """By the directories of a TIFF, or a BigTIFF, which are a list linked by their places."""
-    order, big = _TIFF[head[:2]], b"+" in head[2:4]
-    place, count = struct.Struct(order + "IQ"[big]), struct.Struct(order + "HQ"[big])
-    entry = struct.Struct(order + ("HHQ8s" if big else "HHI4s"))
+    order, place, count, entry = _layout(head)
     pages: dict[int, Page] = {}
-    (at,) = place.unpack_from(head, 8 if big else 4)
+    (at,) = place.unpack_from(head, place.size)
     while at:
         if at in pages:
             raise ValueError("its list of images has no end")
@@ -153,60 +151,60 @@ def _tiff_pages(stream: IO[bytes], head: bytes) -> list[Page]:
     return list(pages.values())
 
 
-def tiff_of_page(stream: IO[bytes], at: int) -> bytes:
-    """A TIFF of one image of another, whose directory is there: OpenCV would read all directories
-    before it. Raises ValueError where it is damaged.
-    """
-    size = stream.seek(0, io.SEEK_END)
-    left = 2 * size  # a damaged one may name the same large part many times
+def _layout(head: bytes) -> tuple[str, struct.Struct, struct.Struct, struct.Struct]:
+    """The order of a TIFF's bytes; and how a place, a count of entries, and an entry are packed."""
+    order, big = _TIFF[head[:2]], b"+" in head[2:4]
+    kinds = ("Q", "Q", "HHQ8s") if big else ("I", "H", "HHI4s")
+    place, count, entry = (struct.Struct(order + kind) for kind in kinds)
+    return order, place, count, entry
 
-    def read(at: int, count: int) -> bytes:
+
+def tiff_of_page(stream: IO[bytes], page: Page) -> bytes:
+    """A TIFF of one of a TIFF's images: OpenCV would read the directories of all before it. Raises
+    ValueError where it is damaged.
+    """
+    end = stream.seek(0, io.SEEK_END)
+    left = 2 * end  # a damaged one may name the same large part many times
+
+    def read(at: int, size: int) -> bytes:
         nonlocal left
-        left -= count
-        if at + count > size or left < 0:
+        left -= size
+        if not 0 <= size <= end - at or left < 0:
             raise ValueError("it is damaged or cut off")
         stream.seek(at)
-        return stream.read(count)
+        return stream.read(size)
 
-    head = read(0, 16)
-    order, big = _TIFF[head[:2]], b"+" in head[2:4]
-    place, count = struct.Struct(order + "IQ"[big]), struct.Struct(order + "HQ"[big])
-    entry = struct.Struct(order + ("HHQ8s" if big else "HHI4s"))
-    made = bytearray(head[: 16 if big else 8])
-    (entries,) = count.unpack(read(at, count.size))
-    values: dict[int, tuple[int, int, bytes]] = {}
-    for tag, kind, many, value in entry.iter_unpack(read(at + count.size, entries * entry.size)):
-        length = many * _BYTES.get(kind, 1)
-        if length > place.size:
-            value = read(place.unpack(value)[0], length)
-        values[tag] = kind, many, value
-    for of_places, of_sizes in _PIECES:
-        if of_places in values and of_sizes in values:
-            moved = []
-            places, sizes = (_numbers(order, *values[tag]) for tag in (of_places, of_sizes))
-            for piece in zip(places, sizes, strict=True):
-                moved.append(len(made))
-                made += read(*piece)
-            kind, letter = (16, "Q") if big else (4, "I")
-            values[of_places] = (
-                kind,
-                len(moved),
-                struct.pack(f"{order}{len(moved)}{letter}", *moved),
-            )
-    directory = count.pack(len(values))
-    for tag, (kind, many, value) in values.items():
+    def put(part: bytes) -> int:
+        made.extend(part)
+        return len(made) - len(part)
+
+    made = bytearray(head := read(0, 16))
+    order, place, count, entry = _layout(head)
+    (many,) = count.unpack(read(page.at, count.size))
+    entries = entry.iter_unpack(read(page.at + count.size, many * entry.size))
+    directory, sizes = b"", list[int]()
+    for tag, kind, many, value in sorted(entries, reverse=True):  # sizes, and then their places
+        if kind not in _NUMBERS:
+            continue
+        form = struct.Struct(f"{order}{many}{_NUMBERS[kind]}")
+        if form.size > place.size:
+            value = read(place.unpack(value)[0], form.size)
+        numbers = list(form.unpack_from(value))
+        if tag in _SIZES:
+            sizes = numbers
+        elif tag in _PLACES:
+            if many == 1 and numbers[0]:  # its size may be wrong, or left out
+                most = 2 * page.width * page.height * int(page.kind[1:])
+                sizes = [min(end - numbers[0], max([most, *sizes]))]
+            numbers = [put(read(*piece)) for piece in zip(numbers, sizes, strict=False)]
+            kind, many = 16 if place.size == 8 else 4, len(numbers)
+        value = struct.pack(f"{order}{many}{_NUMBERS[kind]}", *numbers)
         if len(value) > place.size:
-            made += bytes(len(made) % 2)
-            value, rest = place.pack(len(made)), value
-            made += rest
-        directory += entry.pack(tag, kind, many, value)
-    made += bytes(len(made) % 2)
-    place.pack_into(made, 8 if big else 4, len(made))
-    return bytes(made + directory + place.pack(0))
-
-
-def _numbers(order: str, kind: int, many: int, value: bytes) -> tuple[int, ...]:
-    return struct.unpack_from(f"{order}{many}{_WHOLE.get(kind, 'I')}", value)
+            value = place.pack(put(value))
+        directory = entry.pack(tag, kind, many, value) + directory
+    directory = count.pack(len(directory) // entry.size) + directory + place.pack(0)
+    place.pack_into(made, place.size, put(directory))
+    return bytes(made)
 
 
 def decoded_depth(content: bytes) -> np.ndarray:

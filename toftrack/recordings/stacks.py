@@ -139,13 +139,13 @@ class _Tiff:
             pages = pages_of(stream)
             if not pages or not pages[0].is_depth or len(set(pages)) > 1:
                 raise ValueError("its images are not grey, of one size, and of 16 bits or floats")
-        self._path, self._places = path, [page.at for page in pages]
+        self._path, self._pages = path, pages
         self.shape = (len(pages), pages[0].height, pages[0].width)
         self.dtype = np.dtype(pages[0].kind)
 
     def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
         with open_to_read(self._path) as stream:
-            content = tiff_of_page(stream, self._places[int(at[0])])
+            content = tiff_of_page(stream, self._pages[int(at[0])])
         found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
         if found is None or found.shape != self.shape[1:]:
             raise ValueError("OpenCV cannot decode it")
