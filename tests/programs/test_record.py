@@ -182,7 +182,7 @@ def test_who_says_how_many_frames_gets_them(
     settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
     assert record(str(path), *settings, "--frames", "9") == 0
     assert Replay(path).frames == 9
-    assert record(str(path), *settings, "--frames", "9", "record_limit_gb=1", "--overwrite") == 0
+    assert record(str(path), *settings, "--frames", "9", "++record_limit_gb=1", "--overwrite") == 0
     assert Replay(path).frames < 9
 
 

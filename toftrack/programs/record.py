@@ -62,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     config = _configuration(options, raw=suffix == ".srs")
     if options.limit is None:
         wanted = options.frames or options.seconds  # which a default must not cut short
-        chosen = any(word.startswith("record_limit_gb=") for word in options.overrides)
+        chosen = any("record_limit_gb=" in word for word in options.overrides)
         options.limit = math.inf if wanted and not chosen else config.record_limit_gb
     with one_sentence():
         device: Device = instantiate(config.device)
