@@ -48,8 +48,8 @@ def npy(path: Path, images: np.ndarray) -> Path:
     return path
 
 
-def tiff(path: Path, images: np.ndarray) -> Path:
-    cv2.imwritemulti(str(path), list(images))
+def tiff(path: Path, images: np.ndarray, rows_a_strip: int = 5) -> Path:
+    cv2.imwritemulti(str(path), list(images), [cv2.IMWRITE_TIFF_ROWSPERSTRIP, rows_a_strip])
     return path
 
 
@@ -243,7 +243,7 @@ def test_an_image_of_a_tiff_is_read_without_those_before_it(tmp_path: Path) -> N
 
 
 def test_a_tiff_without_the_sizes_of_its_strips_is_read(tmp_path: Path) -> None:
-    content = tiff(tmp_path / "a.tif", WORDS).read_bytes()
+    content = tiff(tmp_path / "a.tif", WORDS, len(WORDS[0])).read_bytes()
     sizes = struct.pack("<HHI", 279, 4, 1)
     assert content.count(sizes) == COUNT
     (tmp_path / "a.tif").write_bytes(content.replace(sizes, struct.pack("<HHI", 280, 4, 1)))
