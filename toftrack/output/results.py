@@ -33,7 +33,7 @@ _MOST_HELD = 10_000_000
 """Dropped frames between others, 4 days of them; more are none, but a damaged number."""
 _MOST_DIMS = 100
 _MOST_BYTES = 2**34
-"""Of a track.npz, of which a hand takes 2.4 kB a frame: two hands for a day."""
+"""Of a track.npz, of which a hand takes 2.4 kB a frame: two hands for more than a day."""
 _TEXTS = ("joint_names", "metadata")
 _PARTS = ("camera", "config", "device", "hand_shape", "pose_space")
 """Of the metadata: what is said of each."""
