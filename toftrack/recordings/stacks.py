@@ -209,13 +209,11 @@ class _Hdf5:
         axis = next(axis for axis, one in enumerate(at) if not isinstance(one, slice))
         image_bytes = found.nbytes // found.shape[axis]
         count = max(1, min(found.chunks[axis], _SMALL_BYTES // image_bytes))
-        row = int(at[axis]) % count
-        here = axis, int(at[axis]) - row
-        if self._latest is None or self._latest[0] != here:
-            some = [slice(None)] * 3
-            some[axis] = slice(here[1], here[1] + count)
-            self._latest = here, found[tuple(some)]
-        return self._latest[1].take(row, axis)
+        begin = int(at[axis]) // count * count
+        if self._latest is None or self._latest[0] != (axis, begin):
+            some = *at[:axis], slice(begin, begin + count), *at[axis + 1 :]
+            self._latest = (axis, begin), found[some]
+        return self._latest[1].take(int(at[axis]) - begin, axis)
 
     def close(self) -> None:
         if self._file is not None:
