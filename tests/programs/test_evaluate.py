@@ -32,7 +32,7 @@ def test_the_table_and_the_file_say_how_good_it_is(
     printed = capsys.readouterr()
     firsts = [line.split()[0] for line in printed.out.splitlines()]
     assert firsts == ["sequence", "P0/1", "P0/TIP", "mean", "compared:", "tips:"]
-    assert "12/12" in printed.err
+    assert not printed.err
     facts = json.loads(report.read_text())
     assert (facts["data_set"], facts["overrides"]) == ("MSRA15", [FEW])
     assert facts["tip_inset_mm"] == 7
@@ -50,7 +50,7 @@ def test_sequences_and_frames_can_be_chosen_and_labels_without_image_are_told(
     main(["MSRA15", str(folder), "--sequences", "P0/TIP", "--frames", "2", "--tip-inset", "0", FEW])
     printed = capsys.readouterr()
     assert "P0/1" not in printed.out
-    assert "2/2" in printed.err and "note: P0/TIP: 1 labels have no image" in printed.err
+    assert "note: P0/TIP: 1 labels have no image" in printed.err
     assert "ours are moved 0 mm" in printed.out
 
 

@@ -65,6 +65,10 @@ def test_a_run_writes_its_files_directly_into_its_folder(whole) -> None:
     assert not list(folder.glob("*.part"))
 
 
+def test_a_log_has_no_progress_bar(whole) -> None:
+    assert "\r" not in whole[-1]
+
+
 def test_what_is_logged_meanwhile_stands_on_a_line_of_its_own(whole) -> None:
     folder, _, _, err = whole
     assert re.search(r"[\r\n]the recording 'kept.npz' ends after \d frames.*\n", err)

@@ -86,7 +86,7 @@ def track(device: Device, config: DictConfig) -> Tracked:
     with one_sentence():
         tracker, detector = build_tracker(config), instantiate(config.detector)
     camera, joints, confidence = device.camera, [], []
-    for frame in tqdm(device, total=device.frames, unit=" frames", file=sys.stderr):
+    for frame in tqdm(device, total=device.frames, unit=" frames", file=sys.stderr, disable=None):
         depth_m = camera.rectify(frame.depth, frame.radial)
         estimate = tracker.step(depth_m, camera.K, frame.index, frame.timestamp_s)
         joints.append(np.where(estimate.lost, np.float32(np.nan), estimate.joints_m))

@@ -52,7 +52,7 @@ def evaluate(
     """
     counts = [len(sequence.joints_m[:frames]) for sequence in sequences]
     figures = {}
-    with tqdm(total=sum(counts), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+    with tqdm(total=sum(counts), unit=" frames", file=sys.stderr, disable=None) as bar:
         for sequence, count in zip(sequences, counts, strict=True):
             bar.set_postfix_str(sequence.name, refresh=False)
             if sequence.left_out:

@@ -165,7 +165,9 @@ def run_jobs(todo: Sequence[Job], workers: int, words: str = "") -> Iterator[lis
     total = sum(job.source.frames for job in todo)
     here = workers == 1 or len(todo) < 2
     finished = ((job, rows_of_job(job)) for job in todo) if here else _in_processes(todo, workers)
-    with tqdm(total=total, unit=" frames", file=sys.stderr, desc=words or None) as bar:
+    with tqdm(
+        total=total, unit=" frames", file=sys.stderr, desc=words or None, disable=None
+    ) as bar:
         for job, rows in finished:
             bar.set_postfix_str(f"{job.source.name}, seed {job.seed}", refresh=False)
             yield rows

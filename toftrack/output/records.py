@@ -196,7 +196,13 @@ def _bar(words: str, frames: int) -> tqdm:
     """Of what may take long; not seen before it took two seconds."""
     shape = "{desc}: {percentage:3.0f}%|{bar}| {total_fmt} frames"
     return tqdm(
-        desc=words, total=frames, delay=_SOON_S, leave=False, bar_format=shape, file=sys.stderr
+        desc=words,
+        total=frames,
+        delay=_SOON_S,
+        leave=False,
+        bar_format=shape,
+        file=sys.stderr,
+        disable=None,
     )
 
 

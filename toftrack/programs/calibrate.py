@@ -107,7 +107,7 @@ def _views(store: FrameStore, board: tuple[int, int], numbers: np.ndarray) -> li
             "rows (a board of 8x6 squares is 7x5)"
         )
     views: list[View] = []
-    for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, mininterval=0.5):
+    for number in tqdm(numbers, unit=" frames", desc="corners", file=sys.stderr, disable=None):
         corners = calibration.find_corners(_amplitude(store, number), board)
         if corners is not None:
             views.append(View(int(number), corners))

@@ -101,7 +101,7 @@ def convert(
             _warn(f"{source}: {damage}; the frames before are converted")
         if store.left_out:
             _warn(f"{source}: {store.left_out}")
-        with tqdm(total=len(store), unit=" frames", file=sys.stderr, mininterval=0.5) as bar:
+        with tqdm(total=len(store), unit=" frames", file=sys.stderr, disable=None) as bar:
             if kind == ".npz":
                 write_recording(target, store, bar.update)
             elif kind == ".srs":

@@ -87,7 +87,7 @@ def draw_figures(
         # The folder within the run's must be no link; which one --out is, the user says.
         make_folder(target) if out is None else target.mkdir(parents=True, exist_ok=True)
         drawn = [(f"{name}.png", draw) for name, draw in figures.items()]
-        bar = tqdm(drawn, unit=" figures", file=sys.stderr, delay=1.0, leave=False)
+        bar = tqdm(drawn, unit=" figures", file=sys.stderr, delay=1.0, leave=False, disable=None)
         written = write_figures(target, bar)
     if not written:
         raise ToftrackError("no figure could be drawn; the notes above say why")

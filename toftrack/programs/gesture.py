@@ -125,7 +125,7 @@ def _track(
         tracker = build_tracker(configuration("gestures=none", *overrides))
     first = int(np.searchsorted(times, begin_s - _LEAD_S))
     angles, believed = [], []
-    for row in tqdm(range(first, rows[-1] + 1), unit=" frames", file=sys.stderr):
+    for row in tqdm(range(first, rows[-1] + 1), unit=" frames", file=sys.stderr, disable=None):
         depth_m = frames.camera.rectify(frames.image(row)[0], frames.radial)
         estimate = tracker.step(depth_m, frames.camera.K, row, float(times[row]))
         if row >= rows[0]:

@@ -159,7 +159,7 @@ def _record_raw(device: Sr3000, options: argparse.Namespace) -> None:
 
 
 def _progress(frames: int | None) -> tqdm:
-    return tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5)
+    return tqdm(total=frames, unit=" frames", file=sys.stderr, mininterval=0.5, disable=None)
 
 
 def _configuration(options: argparse.Namespace, raw: bool) -> DictConfig:

@@ -10,7 +10,6 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -178,14 +177,17 @@ class Run:
             results.append(estimates)
             shapes.save()
 
-        progress = partial(
-            tqdm, total=self.device.frames, unit=" frames", file=sys.stderr, mininterval=0.2
-        )
-        if in_sweep():  # gone afterwards, and none at all where nobody looks
-            progress = partial(progress, leave=False, disable=None)
         results.complete = False
         try:
-            with progress() as bar, logging_redirect_tqdm():  # above the bar, on lines of their own
+            bar = tqdm(
+                total=self.device.frames,
+                unit=" frames",
+                file=sys.stderr,
+                mininterval=0.2,
+                disable=None,  # in a log, which would keep every state of it
+                leave=not in_sweep(),
+            )
+            with bar, logging_redirect_tqdm():  # above the bar, on lines of their own
                 for frame in frames_of(self.device):
                     began_s = time.perf_counter()
                     with shutdown.not_now():

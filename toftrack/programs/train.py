@@ -109,6 +109,7 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
         desc="learning spaces for the table of errors"
         + (" (compare=[] takes fewer)" if len(dims) > 1 else ""),
         file=sys.stderr,
+        disable=None,
         unit=" spaces",
         delay=_SILENT_S,
         leave=not in_sweep(),
