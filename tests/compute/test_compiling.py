@@ -188,6 +188,14 @@ def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
     assert other.parent == here.parent and other != here
 
 
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such variable")
+def test_a_cache_that_is_not_absolute_is_ignored(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", "here")
+    assert compiling._private_folder().is_relative_to(tmp_path / ".cache" / "toftrack")
+
+
 def test_what_another_process_is_compiling_is_waited_for() -> None:
     values, kernel = np.arange(3.0), _made()
     assert not _is_loaded()

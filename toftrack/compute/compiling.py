@@ -143,8 +143,9 @@ def _private_folder() -> Path:
     """The folder of this user's kernels for this machine, made if need be. Raises OSError or
     RuntimeError.
     """
-    given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME")
-    caches = _config.CACHE_DIR or given or Path.home() / ".cache"
+    given = os.environ.get("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", "")
+    own = given if os.path.isabs(given) else Path.home() / ".cache"  # as its specification has it
+    caches = _config.CACHE_DIR or own
     folder = Path(caches).absolute() / "toftrack" / "kernels"
     folder.mkdir(mode=0o700, parents=True, exist_ok=True)
     found = os.stat(folder)
