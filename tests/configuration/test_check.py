@@ -61,6 +61,8 @@ WRONG = [
     # Parts of two trackers do not mix.
     ("detector=none", "detector=none belongs to experiment=paper, the tracker without networks; "),
     ("experiment=paper lost=calibrated", "lost=calibrated works only with networks"),
+    ("experiment=paper refine.iterations=3", "refine.iterations=3 works only with networks"),
+    ("experiment=paper posterior.overlap=0", "posterior.overlap=0 works only with networks"),
     ("experiment=paper detector=network", "leave it out, or the detector"),
 ]
 

@@ -89,7 +89,7 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     name: of the configuration file.  overrides: of the command line.
     """
     check_interpolations(config)
-    check_tracker(config)
+    check_tracker(config, overrides)
     space = config.get("pose_space") or {}
     of_file = space.get("file") is not None and str(space.get("_target_")).startswith("toftrack.")
     for word in overrides if of_file else ():
@@ -175,8 +175,11 @@ def check_groups(config: DictConfig) -> None:
             )
 
 
-def check_tracker(config: DictConfig) -> None:
-    """Raise ToftrackError where parts of the paper's tracker and of the other one are mixed."""
+def check_tracker(config: DictConfig, overrides: Sequence[str] = ()) -> None:
+    """Raise ToftrackError where parts of the paper's tracker and of the other one are mixed.
+
+    overrides: of the command line, which the error names.
+    """
     without = OmegaConf.select(config, "detector._target_") == _NO_NETWORKS
     given = [
         choice
@@ -185,6 +188,7 @@ def check_tracker(config: DictConfig) -> None:
     ]
     if without and OmegaConf.select(config, "refine.iterations"):
         given.append("refine=gauss_newton")
+    given += [word for word in overrides if without and word.startswith("posterior.")]
     some = ", ".join(given)
     if not given:
         return
@@ -194,6 +198,9 @@ def check_tracker(config: DictConfig) -> None:
             " experiment=paper, or leave detector=none out"
         )
     if without:
+        for word in overrides:
+            if word.startswith("refine."):
+                some = some.replace("refine=gauss_newton", word)
         raise ToftrackError(
             f"{some} works only with networks, which experiment=paper lacks; leave {some} out,"
             " or leave experiment=paper out"
