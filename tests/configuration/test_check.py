@@ -55,6 +55,7 @@ WRONG = [
     ("view=web", "did you mean view=browser?"),
     ("pose_space.file=a.npz pose_space.data=natural", "data=natural is for learning, but pose_"),
     ("device.path=a (1).npz", 'give the recording by its name alone: toftrack track "a (1)'),
+    ("data=leap", "there is no data to choose here; "),
     ("start=rough", "start belongs to experiment=paper; give experiment=paper as well, or leave"),
     ("start.pose=0.1", "start.pose belongs to experiment=paper; "),
     ("experiment=paper start.psoe=0.1", "no setting start.psoe; did you mean start.pose?"),

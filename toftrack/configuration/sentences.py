@@ -203,6 +203,8 @@ def _of_key(chain: Sequence[BaseException]) -> str | None:
         parent = getattr(error, "parent_node", None)
         if isinstance(error, OmegaConfBaseException) and isinstance(parent, DictConfig):
             return _unknown_key(key, parent)
+    if key != _PAPERS_GROUP and "No match in the defaults list" in str(chain[0]):
+        return f"there is no {key} to choose here; leave it out, or see what --help lists"
     return _OF_PAPER.format(key) if key == _PAPERS_GROUP else None
 
 
