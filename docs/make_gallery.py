@@ -8,6 +8,7 @@ in colours (near is red), with the estimated joints. Prints the errors and the f
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -82,4 +83,9 @@ def main(names: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(PICTURES))
+    asked = parser.parse_args().names
+    if unknown := [name for name in asked if name not in PICTURES]:
+        parser.error(f"there is no picture {unknown[0]}; give one of {', '.join(PICTURES)}")
+    main(asked)

@@ -6,6 +6,7 @@ them; each box is a package or module of toftrack/ with what it imports of the o
 
 from __future__ import annotations
 
+import argparse
 import ast
 import functools
 import re
@@ -84,4 +85,5 @@ def picture() -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     PICTURE.write_text(picture())

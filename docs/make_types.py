@@ -6,6 +6,7 @@ python docs/make_types.py
 
 from __future__ import annotations
 
+import argparse
 import json
 from pathlib import Path
 from typing import Any
@@ -66,4 +67,5 @@ def types(schema: dict[str, Any]) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     TYPES.write_text(types(json.loads(SCHEMA.read_text(encoding="utf-8"))), encoding="utf-8")

@@ -8,6 +8,7 @@ class that keeps the same picture takes its place.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import base64
 import contextlib
@@ -86,7 +87,9 @@ def _display():
 if __name__ == "__main__":
     import tempfile
 
-    place = Path(sys.argv[1]).resolve()
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("notebook", type=Path)
+    place = parser.parse_args().notebook.resolve()
     with tempfile.TemporaryDirectory() as empty:
         done = run_notebook(place, Path(empty))
     place.write_text(json.dumps(done, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
