@@ -53,6 +53,7 @@ def test_long_help_names_every_group_and_choice() -> None:
     ("words", "reported"),
     [
         (["trak"], "did you mean toftrack track?"),
+        (["version"], "did you mean toftrack --version?"),
         (["hand.side=left"], "did you mean toftrack track hand.side=left?"),
         (["gone.npz"], "did you mean toftrack track gone.npz?"),
         (["xyz"], "give one of track, train"),
@@ -62,6 +63,24 @@ def test_a_command_that_there_is_not_is_reported(words, reported, capsys) -> Non
     assert front.main(words) == 1
     err = capsys.readouterr().err
     assert err.startswith("error: there is no command") and reported in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "meant"),
+    [
+        ("benchmark acuracy", "accuracy"),
+        ("convert a.npz b.npz --unt 0.001", "--unit"),
+        ("track a.npz --hands 2", "--hands"),
+    ],
+)
+def test_what_was_mistyped_is_named_with_what_may_be_meant(words, meant, capsys) -> None:
+    assert front.main(words.split()) == 1
+    assert meant in capsys.readouterr().err
+
+
+def test_help_of_a_command_is_its_own(capsys) -> None:
+    assert front.main(["help", "convert"]) == 0
+    assert capsys.readouterr().out.startswith("usage: toftrack convert ")
 
 
 def test_a_program_s_status_and_errors_are_those_of_the_command(capsys, tmp_path) -> None:
@@ -186,7 +205,7 @@ def test_a_name_that_begins_with_a_tilde_is_not_somebody_s_home(tmp_path, monkey
 
 
 def test_what_is_neither_is_taken_for_a_file_so_that_the_error_says_it_is_missing() -> None:
-    for name in ("gone.npz", "gone [2]=x.npz"):
+    for name in ("gone.npz", "gone [2]=x.npz", "-"):
         assert with_recording([name])[1] == f"device.path={quoted(name)}"
 
 

@@ -136,6 +136,7 @@ def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> lis
                 f"'{word}' is no recording; settings are given without blanks as {key}=VALUE"
             )
     if len(files) > 1:
+        options_first(others)  # an option that there is not tells more than the word after it
         raise ToftrackError(
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
             " a name that has blanks in it"
@@ -218,7 +219,7 @@ def _readable(override: str) -> str:
 
 
 def _is_file(argument: str, known: Collection[str]) -> bool:
-    if argument.startswith("-") and not os.path.exists(argument):
+    if argument.startswith("-") and argument != "-" and not os.path.exists(argument):
         return False
     key, separator, _ = argument.partition("=")
     if not separator:  # without one, only a deletion is an override

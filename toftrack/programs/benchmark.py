@@ -19,7 +19,12 @@ from toftrack.programs.command_line import plain_parser
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run a measurement. Raises ToftrackError."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    kinds = {"alternating": _alternating, "accuracy": _accuracy, "ablation": _ablation}
+    kinds = {
+        "speed": _speed,
+        "alternating": _alternating,
+        "accuracy": _accuracy,
+        "ablation": _ablation,
+    }
     if given[:1] in (["-h"], ["--help"]):
         print(
             "usage: toftrack benchmark [speed] ...       time of hypotheses and frames\n"
@@ -28,10 +33,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "       toftrack benchmark ablation ...      what each part of the tracker adds\n\n"
             "toftrack benchmark speed --help, and so on, says more"
         )
-    elif given and given[0] in kinds:
+    elif not given or given[0].startswith("-"):
+        _speed(given)
+    elif given[0] in kinds:
         kinds[given[0]](given[1:])
     else:
-        _speed(given[1:] if given[:1] == ["speed"] else given)
+        raise ToftrackError(f"there is no benchmark '{given[0]}'; give one of {', '.join(kinds)}")
 
 
 def _speed(arguments: Sequence[str]) -> None:

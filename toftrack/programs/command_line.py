@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import functools
 import json
 import logging
 import math
 import os
+import re
 import shlex
 import subprocess
 import sys
@@ -123,6 +125,10 @@ class Parser(argparse.ArgumentParser):
     """Says what is wrong in one sentence, without all that there is."""
 
     def error(self, message: str) -> NoReturn:
+        unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)
+        known = self._option_string_actions if unknown else ()
+        if unknown and (near := difflib.get_close_matches(unknown[1], known, n=1)):
+            raise ToftrackError(f"there is no option {unknown[1]}; did you mean {near[0]}?")
         raise ToftrackError(f"{message}; {self.prog} --help tells what there is")
 
 

@@ -83,7 +83,9 @@ _GROUPS_OF_TRAINING = ("data", "pose_space")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command line, by default this process's; returns the exit status."""
     given = sys.argv[1:] if arguments is None else list(arguments)
-    if not given or given[0] in (*_HELP, "help"):
+    if given[:1] == ["help"]:
+        given = [*given[1:], "--help"]
+    if not given or given[0] in _HELP:
         width = max(map(len, _COMMANDS))
         lines = [f"  {name:<{width}}  {about}" for name, about in _COMMANDS.items()]
         say(_OVERVIEW.format(commands="\n".join(lines)), sys.stdout)
@@ -136,6 +138,6 @@ def _unknown(word: str) -> str:
     names = ", ".join(_COMMANDS)
     if "=" in word or Path(word).suffix or Path(word).exists():
         return f"there is no command '{word}'; did you mean toftrack track {word}?"
-    if near := difflib.get_close_matches(word, _COMMANDS, n=1):
+    if near := difflib.get_close_matches(word, [*_COMMANDS, *_HELP, _VERSION], n=1):
         return f"there is no command '{word}'; did you mean toftrack {near[0]}?"
     return f"there is no command '{word}'; give one of {names}"
