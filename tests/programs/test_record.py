@@ -152,7 +152,7 @@ def test_the_command_records_a_camera_of_ones_own(
     (tmp_path / "mine.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.chdir(tmp_path)
-    given = ("hand.npz", "--config-dir", "my_conf", "device=mine", "device.frames=4")
+    given = ("--config-dir", "my_conf", "device=mine", "hand.npz", "device.frames=4")
     assert record(*given) == 0
     assert len(read_recording("hand.npz")) == 4
     assert record(*given, "--frames", "3") == 1  # it exists

@@ -50,6 +50,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     add("overrides", nargs="*", default=[], metavar="KEY=VALUE", help=about)
     # Intermixed: options may stand between the settings.
     options = parser.parse_intermixed_args(arguments)
+    words = sorted([options.out, *options.overrides], key=lambda word: "=" in word)
+    options.out, *options.overrides = words
     for name, whole in (("frames", True), ("seconds", False), ("limit", False)):
         if (value := getattr(options, name)) is not None:
             check_number(f"--{name}", value, 0, above=True, whole=whole)
