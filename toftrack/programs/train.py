@@ -19,6 +19,7 @@ from toftrack.files.safe_files import write_whole
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
+from toftrack.programs import shutdown
 from toftrack.programs.command_line import in_sweep, job_words, typed
 from toftrack.views.figures.chart import write_figures
 from toftrack.views.figures.poses import (
@@ -88,7 +89,8 @@ def train(config: DictConfig) -> float:
     say("\n".join(f"  {path}" for path in (model, *figures, folder / "summary.json")))
     say(f"use it: {_command(model)}")
     if in_sweep():
-        print(f"{job_words()}: {len(data)} training poses, error {error:.2f} degrees; {folder}")
+        line = f"{len(data)} training poses, error {error:.2f} degrees; {folder}"
+        shutdown.say(f"{job_words()}: {line}", sys.stdout)
     return error
 
 
