@@ -207,6 +207,8 @@ def test_exact_corners_give_the_exact_lens_and_planes() -> None:
     [
         (["--board", "7", "--square", "0.03"], "COLUMNSxROWS"),
         (["--board", "7x5", "--square", "30"], "metres"),
+        (["--board", "9x6", "--square", "0.03", "--out", "gone/camera.json"], "No such file"),
+        (["--board", "9x6", "--square", "0.03", "--out", "."], "Is a directory"),
         (["--board", "9x6", "--square", "0.03", "--frames", "3"], "no 9x6 chequerboard"),
         (["--board", "7x5", "--square", "0.025", "--frames", "10"], "0.83 times as far apart"),
     ],

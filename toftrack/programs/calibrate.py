@@ -8,6 +8,7 @@ that matter, turned to all sides, slowly. The camera file serves every device: `
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -21,7 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.safe_files import write_whole
+from toftrack.files.safe_files import check_replaceable, write_whole
 from toftrack.frames import calibration
 from toftrack.frames.calibration import DepthFit, DepthPairs, Lens, View
 from toftrack.frames.camera import Camera
@@ -60,6 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise ToftrackError(
             f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
         )
+    out = Path(options.out).expanduser()
+    with reported_errors(f"the camera file '{out}' cannot be written", "choose another place"):
+        check_replaceable(out)  # before minutes of work
+        os.stat(out.absolute().parent)
     given = Given(camera_file=options.camera, modulation_mhz=options.modulation)
     with closing(open_with_own_camera(options.recording, given)) as store:
         size = store.camera.width, store.camera.height
@@ -84,7 +89,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     camera = replace(
         lens.camera, depth_polynomial=found.polynomial, depth_polynomial_range_m=found.range_m
     )
-    out = Path(options.out).expanduser()
     folder = Path(options.report).expanduser() if options.report else out.with_suffix(".report")
     camera.save(out)
     facts = _facts(start, camera, lens, pairs, found, len(numbers))
