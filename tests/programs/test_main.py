@@ -31,7 +31,9 @@ def test_help_begins_with_what_it_does_and_three_examples_and_loads_little(words
         assert f"| {slow}\n" not in done.stderr
 
 
-@pytest.mark.parametrize("words", [["track", "--help"], ["track", "--hydra-help"]])
+@pytest.mark.parametrize(
+    "words", [["track", "--help"], ["track", "--hydra-help"], ["track", "--info"]]
+)
 def test_help_that_nobody_reads_is_no_traceback(words: list[str]) -> None:
     reading, writing = os.pipe()
     os.close(reading)
@@ -71,6 +73,8 @@ def test_a_command_that_there_is_not_is_reported(words, reported, capsys) -> Non
         ("benchmark acuracy", "accuracy"),
         ("convert a.npz b.npz --unt 0.001", "--unit"),
         ("track a.npz --hands 2", "--hands"),
+        ("track --cfg", "error: --cfg has no value"),
+        ("track --config-dir", "error: --config-dir has no value"),
     ],
 )
 def test_what_was_mistyped_is_named_with_what_may_be_meant(words, meant, capsys) -> None:

@@ -222,7 +222,9 @@ def read_run(folder: str | Path) -> Run:
     """
     folder = Path(folder).expanduser()
     if not folder.is_dir():
-        raise ToftrackError(f"no folder '{folder}'; give the output folder of toftrack track")
+        raise ToftrackError(
+            f"there is no folder '{folder}'; give the output folder of toftrack track"
+        )
     missing = [name for name in FILES if not (folder / name).is_file()]
     if len(missing) == len(FILES):
         raise ToftrackError(

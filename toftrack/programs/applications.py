@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import re
 import sys
@@ -78,23 +79,24 @@ def start(
     job: Callable[[DictConfig], float], program: str, config: str, arguments: Sequence[str]
 ) -> None:
     """Run a Hydra application; it reads the command line of the process."""
-    folder = str(configuration_folder())
+    folder, words = str(configuration_folder()), options_first(arguments)
     for own in config_folders(arguments):
         searched(own)
     offer_installed()
     application = hydra.main(version_base="1.3", config_path=folder, config_name=config)(job)
-    before = sys.argv
+    before, told = sys.argv, logging.raiseExceptions
     if "-sc" in arguments:  # Hydra tells a shell to complete what the program is called by
         program = before[0]
         os.environ["COMP_LINE"] = _line_to_complete(os.environ.get("COMP_LINE", ""))
-    sys.argv = [program, *options_first(arguments)]
+    sys.argv = [program, *words]
+    logging.raiseExceptions = False  # what Hydra logs of --info may have no reader any more
     try:
         with modest_files():
             application()
     except BrokenPipeError:  # of what Hydra itself tells, as --hydra-help: nobody reads on
         shutdown.forget_streams()
     finally:
-        sys.argv = before
+        sys.argv, logging.raiseExceptions = before, told
 
 
 def _line_to_complete(line: str) -> str:
@@ -184,6 +186,8 @@ def options_first(arguments: Sequence[str]) -> list[str]:
         else:
             options.append(word)
         value_follows = not value_follows and word in _WITH_VALUE
+    if value_follows:
+        raise ToftrackError(f"{options[-1]} has no value; --hydra-help tells which there are")
     return [*options, *overrides]
 
 

@@ -76,7 +76,9 @@ def read_runs(folder: str | Path) -> list[Run]:
     """Every job below a folder, in the order of their numbers; ToftrackError when there is none."""
     folder = Path(folder)
     if not folder.is_dir():
-        raise ToftrackError(f"no folder {folder}; give the folder of a sweep, multirun/DATE/TIME")
+        raise ToftrackError(
+            f"there is no folder '{folder}'; give the folder of a sweep, multirun/DATE/TIME"
+        )
     found = [path.parents[1] for path in folder.rglob(".hydra/overrides.yaml")]
     if not found:
         raise ToftrackError(
