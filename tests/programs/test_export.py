@@ -133,6 +133,7 @@ def test_a_csv_has_a_row_a_frame_and_slot(
                 assert place == pytest.approx(hand.joints_m[joint].tolist(), abs=1e-5)
                 assert row[f"{name}_ok"] == "1"
             assert row["pointing_origin_x_m"] == ""
+            assert row["side_probability"] == "1.0"  # a number that need not be whole
 
 
 def test_of_two_hands_of_one_side_the_joints_have_names_of_their_own(tmp_path: Path) -> None:

@@ -174,5 +174,6 @@ def _cell(value: Any) -> str:
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, float):
-        return f"{value:.6g}" if np.isfinite(value) else ""
+        # 0.0, not 0: readers that look at the first rows alone take whole numbers for the type.
+        return str(float(f"{value:.6g}")) if np.isfinite(value) else ""
     return str(value)
