@@ -41,6 +41,17 @@ print(toftrack.__version__)
     assert done.stdout.splitlines() == ["[]", "True", toftrack.__version__], done.stderr
 
 
+def test_tracking_in_a_notebook_loads_no_progress_bar_that_warns_there(tmp_path: Path) -> None:
+    code = """
+import sys, toftrack
+toftrack.track("device=sample", "device.stop=1").results()
+print("tqdm.auto" in sys.modules)
+"""
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.stdout == "False\n", done.stderr
+
+
 def test_every_stable_name_is_there_and_no_other() -> None:
     for name in toftrack.__all__:
         assert getattr(toftrack, name) is not None, name

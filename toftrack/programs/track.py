@@ -20,7 +20,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
-from tqdm.contrib.logging import logging_redirect_tqdm
 
 from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import Pace
@@ -187,7 +186,13 @@ class Run:
                 disable=None,  # in a log, which would keep every state of it
                 leave=not in_sweep(),
             )
-            with bar, logging_redirect_tqdm():  # above the bar, on lines of their own
+            above: AbstractContextManager[None] = nullcontext()
+            if not bar.disable:
+                # In a notebook, which shows no bar, its import warns of ipywidgets.
+                from tqdm.contrib.logging import logging_redirect_tqdm
+
+                above = logging_redirect_tqdm()  # on lines of their own
+            with bar, above:
                 for frame in frames_of(self.device):
                     began_s = time.perf_counter()
                     with shutdown.not_now():
