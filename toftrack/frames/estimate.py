@@ -79,13 +79,14 @@ class Estimate:
     joints_m: np.ndarray
     """(21, 3) float32 metres, camera frame, in the order of JOINT_NAMES, which is MediaPipe's."""
     state: np.ndarray
-    """(27,) float32: translation (3, m), rotation vector (3, rad), joint angles (21, rad)."""
+    """(27,) float32: the wrist's place (3, m), rotation vector (3, rad) that turns a hand held up,
+    palm to the camera, into this one, and joint angles (21, rad) in the order of ANGLE_NAMES."""
     latent: np.ndarray
     """(d,) float32 pose-space coordinates."""
     score: float
     """The likelihood head's score, 0..1."""
     covariance: np.ndarray = _on_demand(10, 10)
-    """(6 + d, 6 + d) float32 over translation, rotation (tangent space) and latent."""
+    """(6 + d, 6 + d) float32 over translation, rotation (about the camera's axes) and latent."""
     effective_sample_size: float = math.nan
     """Of the weights, before resampling."""
     compute_s: float = math.nan
