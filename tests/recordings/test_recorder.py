@@ -298,6 +298,13 @@ def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+def test_frames_that_wait_while_python_ends_are_recorded(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "hand.npz", Images(), 1.0) as recorder:
+        recorder._second.shutdown()  # as Python does at its end
+        recorder.put(one_frame(), wait=True)
+    assert recorder.ended is None and recorder.frames == 1
+
+
 @pytest.mark.parametrize(("most_bytes", "waiting"), [(2**28, 32), (1, 2)])
 def test_a_live_run_does_not_wait_for_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, most_bytes: int, waiting: int

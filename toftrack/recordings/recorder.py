@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Protocol, Self
@@ -177,11 +178,14 @@ class Recorder:
             if amplitude.shape != frame.depth.shape:
                 raise ToftrackError(f"the amplitude of frame {frame.index} has another size")
             words = np.clip(amplitude, 0, 0xFFFF).astype(IMAGE_TYPES[1]).tobytes()
-            second = words, self._second.submit(compressed, words)
+            try:
+                second = words, self._second.submit(compressed, words).result
+            except RuntimeError:  # the program has come to its end, with frames that still wait
+                second = words, partial(compressed, words)
         depth = frame.depth.astype(IMAGE_TYPES[0], copy=False).tobytes()
         images = [depth, compressed(depth)]
         if second is not None:
-            images += [second[0], second[1].result()]
+            images += [second[0], second[1]()]
         if first:
             self._file.begin(facts)
             self._facts = facts
