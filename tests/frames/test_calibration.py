@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -222,8 +221,7 @@ def test_errors_are_one_sentence(
     capfd: pytest.CaptureFixture,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["calibrate", str(recording), *arguments])
-    assert command_line.run(calibrate.main) == 1
+    assert command_line.run(lambda: calibrate.main([str(recording), *arguments])) == 1
     last = capfd.readouterr().err.strip().splitlines()[-1]
     assert last.startswith("error: ")
     assert words in last

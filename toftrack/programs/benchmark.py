@@ -6,7 +6,6 @@ import argparse
 import json
 import os
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,16 +15,16 @@ from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
 from toftrack.programs.command_line import plain_parser
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Run a measurement. Raises ToftrackError."""
-    given = sys.argv[1:] if arguments is None else list(arguments)
     kinds = {
         "speed": _speed,
         "alternating": _alternating,
         "accuracy": _accuracy,
         "ablation": _ablation,
     }
-    if given[:1] in (["-h"], ["--help"]):
+    first = next(iter(arguments), "-")
+    if first in ("-h", "--help"):
         print(
             "usage: toftrack benchmark [speed] ...       time of hypotheses and frames\n"
             "       toftrack benchmark alternating ...   frames in turn with MediaPipe's; starts\n"
@@ -33,12 +32,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             "       toftrack benchmark ablation ...      what each part of the tracker adds\n\n"
             "toftrack benchmark speed --help, and so on, says more"
         )
-    elif not given or given[0].startswith("-"):
-        _speed(given)
-    elif given[0] in kinds:
-        kinds[given[0]](given[1:])
+    elif first.startswith("-"):
+        _speed(arguments)
+    elif first in kinds:
+        kinds[first](arguments[1:])
     else:
-        raise ToftrackError(f"there is no benchmark '{given[0]}'; give one of {', '.join(kinds)}")
+        raise ToftrackError(f"there is no benchmark '{first}'; give one of {', '.join(kinds)}")
 
 
 def _speed(arguments: Sequence[str]) -> None:

@@ -41,7 +41,7 @@ _SEARCHED = 24
 """So many frames are looked at for a board before all are searched for its corners: 5 s."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
     parser = plain_parser("toftrack calibrate", __doc__)
     add = parser.add_argument

@@ -110,10 +110,12 @@ def run(main: Callable[[], object]) -> int:
     return status if isinstance(status, int) else 0
 
 
-def plain_parser(program: str, about: str | None) -> argparse.ArgumentParser:
+def plain_parser(
+    program: str, about: str | None, usage: str | None = None
+) -> argparse.ArgumentParser:
     """A parser whose help shows a text, of several lines, as it stands."""
     kind = argparse.RawDescriptionHelpFormatter
-    return Parser(prog=program, description=about, formatter_class=kind)
+    return _Parser(program, usage, about, formatter_class=kind)
 
 
 def typed(words: Sequence[str]) -> str:
@@ -121,7 +123,7 @@ def typed(words: Sequence[str]) -> str:
     return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
-class Parser(argparse.ArgumentParser):
+class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one sentence, without all that there is."""
 
     def error(self, message: str) -> NoReturn:

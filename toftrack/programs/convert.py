@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import whole_file
-from toftrack.programs.command_line import Parser
+from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.image_folder import write_image_folder
@@ -36,9 +36,9 @@ from toftrack.recordings.srs import SrsFacts, SrsInit, SrsRecording, srs_frame, 
 from toftrack.recordings.store import open_recording
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line and convert. Raises ToftrackError."""
-    parser = Parser(prog="toftrack convert", description=__doc__)
+    parser = plain_parser("toftrack convert", __doc__)
     add = parser.add_argument
     add("source", metavar="IN", help="the recording to read")
     add("target", metavar="OUT", help=".srs, .npz, or a folder")

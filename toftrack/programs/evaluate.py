@@ -12,13 +12,12 @@ from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_
 from toftrack.evaluation.public import evaluate, table, totals
 from toftrack.evaluation.results import checked_targets, write_text
 from toftrack.hand.skeleton import JOINT_NAMES
-from toftrack.programs.command_line import Parser
+from toftrack.programs.command_line import plain_parser
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line, track, print the table. Raises ToftrackError."""
-    about = "Evaluate the tracker on a public data set of labelled depth images."
-    parser = Parser(prog="toftrack evaluate", description=about)
+    parser = plain_parser("toftrack evaluate", __doc__)
     add = parser.add_argument
     add("data_set", metavar="DATASET", help=", ".join(DATA_SETS))
     add("folder", metavar="FOLDER", help="where the data set lies")

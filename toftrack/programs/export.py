@@ -31,7 +31,7 @@ from toftrack.programs.command_line import plain_parser
 FORMATS = ("glb", "bvh", "csv")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line, write the file, print its name. Raises ToftrackError."""
     parser = plain_parser("toftrack export", __doc__)
     parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")

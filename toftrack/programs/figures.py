@@ -39,7 +39,7 @@ from toftrack.views.figures.runs import (
 )
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line and draw. Raises ToftrackError."""
     parser = plain_parser("toftrack figures", __doc__)
     parser.add_argument("run", metavar="RUN_DIR", help="the output folder of toftrack track")

@@ -23,7 +23,7 @@ from toftrack.errors import ToftrackError
 from toftrack.gestures.definitions import OTHER, SETS
 from toftrack.gestures.files import NamedPose, learned_pose, read_poses, save_poses
 from toftrack.gestures.recognition import FLEXION_RAD, Gestures, gestures_with
-from toftrack.programs.command_line import Parser
+from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_source
 
@@ -32,13 +32,10 @@ _LEAD_S = 1.0
 """So long before the part that is asked for the tracking begins, to have found the hand by then."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line and do what it says. Raises ToftrackError."""
-    parser = Parser(
-        prog="toftrack gesture",
-        description="Your own gestures: learn one from a recording, list or remove them.",
-        usage="%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME",
-    )
+    usage = "%(prog)s add NAME RECORDING --from S --to S [OVERRIDE ...] | list | remove NAME"
+    parser = plain_parser("toftrack gesture", __doc__, usage)
     option = parser.add_argument
     option("command", choices=("add", "list", "remove"))
     about = "its name; the recording that shows it (or sample); settings, as hand.side=left"

@@ -47,7 +47,7 @@ _OF_CONVERT = {
 """Overrides that say how a recording is to be understood, as options of `toftrack convert`."""
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
     parser = plain_parser("toftrack label", __doc__)
     add = parser.add_argument

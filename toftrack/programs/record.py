@@ -33,7 +33,7 @@ from toftrack.recordings.sr_frame import REGISTERS
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsWriter
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line and record. Raises ToftrackError, and EndedError at the end of an
     interrupted recording, whose frames are all in the file."""
     parser = plain_parser("toftrack record", __doc__)

@@ -31,7 +31,7 @@ from toftrack.views.video import cut_to_whole
 _MADE = ("track.npz", "summary.json")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """Parse the command line, write the files, print the table. Raises ToftrackError."""
     parser = plain_parser("toftrack recover", __doc__)
     about = "the output folder of toftrack track, or a recording"

@@ -1,8 +1,10 @@
 """What a sweep found: `toftrack report multirun/DIR`.
 
-Gathers the overrides (.hydra/overrides.yaml) and the figures (summary.json) of every job below a
-folder into sweep.csv, a table, and sweep.png: the error against the cost of a frame, with the
-spread over seeds. Jobs that failed are named and left out of the means.
+Gathers the overrides (.hydra/overrides.yaml) and the figures (summary.json) of every job, or run,
+below a folder into sweep.csv, sweep.png and a table. For each choice of settings it shows a
+figure's mean over the runs, its standard deviation over seeds (spread), and the median time of a
+frame. Jobs that failed are named and left out of the means. To compare settings with intervals,
+use `toftrack benchmark accuracy --compare`.
 """
 
 from __future__ import annotations
@@ -23,7 +25,7 @@ import yaml
 from toftrack.errors import ToftrackError, one_line, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import open_to_read, write_whole
-from toftrack.programs.command_line import Parser
+from toftrack.programs.command_line import plain_parser
 from toftrack.views.figures import chart
 
 _FIGURES = (
@@ -284,15 +286,9 @@ def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], li
     return runs, groups
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
+def main(arguments: Sequence[str]) -> None:
     """The command line; jobs of the sweep that failed are no error. Raises ToftrackError."""
-    about = (
-        "Gather the jobs of a sweep, or all runs below a folder, into one table. For each choice of"
-        " settings it shows a figure's mean over the runs, its standard deviation over seeds"
-        " (spread), and the median time of a frame. To compare settings with intervals, use"
-        " `toftrack benchmark accuracy --compare`."
-    )
-    parser = Parser(prog="toftrack report", description=about)
+    parser = plain_parser("toftrack report", __doc__)
     about = "that of the sweep, multirun/DATE/TIME, or one into which you moved runs to compare"
     parser.add_argument("folder", nargs="+", help=about)
     about = (
