@@ -48,17 +48,18 @@ class _Program:
     """Their folders."""
     locks: list[int] = field(default_factory=list)
     """Descriptors of the folders that nobody else may write into."""
+    new_folders: dict[Path, tuple[Path, ...]] = field(default_factory=dict)
+    """Of a run or sweep, with those of them and their parents that were not there, the innermost
+    first."""
 
 
 _program = _Program()
 
 
 class _JobFailedError(BaseException):
-    """Carries a job's error past Hydra, which would print a line of its own about an Exception."""
-
-    def __init__(self, error: Exception) -> None:
-        super().__init__(str(error))
-        self.error = error
+    """Carries a job's error, its only argument, past Hydra, which would print a line of its own
+    about an Exception.
+    """
 
 
 def run(main: Callable[[], object]) -> int:
@@ -69,14 +70,12 @@ def run(main: Callable[[], object]) -> int:
     main: usually a function under `@hydra.main` and `@sweep_job`; an int that it returns is the
     status.
     """
-    _program.running = True
-    _program.tracebacks = os.environ.get(FULL_ERROR) == "1"
-    _program.failed_jobs.clear()
-    _new_folders.clear()
+    global _program
+    _program = program = _Program(running=True, tracebacks=os.environ.get(FULL_ERROR) == "1")
     try:
         with shutdown.obeyed(), _hydra_raises():
             status = main()
-            _new_folders.clear()
+            program.new_folders.clear()
     except KeyboardInterrupt as end:
         shutdown.say("interrupted", sys.stderr)  # what was kept was said
         shutdown.forget_streams()
@@ -92,20 +91,18 @@ def run(main: Callable[[], object]) -> int:
         shutdown.forget_streams()
         return shutdown.requested_status() or 1
     except _JobFailedError as failure:
-        return _report(failure.error)
+        return _report(failure.args[0])
     except Exception as error:
         return _report(error)
     finally:
-        for folder, parents in _new_folders.items():
+        for folder, parents in program.new_folders.items():
             with contextlib.suppress(OSError):  # the error that is being reported counts for more
                 _clear(folder, parents)
-        _new_folders.clear()
-        while _program.locks:
-            leave_folder(_program.locks.pop())
-        _program.running = False
-    if _program.failed_jobs:
-        count = len(_program.failed_jobs)
-        print(f"error: {count} of the jobs failed, see above", file=sys.stderr)
+        for lock in program.locks:
+            leave_folder(lock)
+        _program = _Program()
+    if program.failed_jobs:
+        print(f"error: {len(program.failed_jobs)} of the jobs failed, see above", file=sys.stderr)
         return 1
     return status if isinstance(status, int) else 0
 
@@ -204,10 +201,7 @@ def _report(error: BaseException, job: str = "") -> int:
 
 # Hydra makes the folder of a run, with its own files in it, before the program has looked at its
 # settings: that of one that failed before it wrote anything of its own goes away again.
-_HYDRAS = frozenset({"config.yaml", "hydra.yaml", "overrides.yaml"})
-_new_folders: dict[Path, tuple[Path, ...]] = {}
-"""Of a run or sweep, with those of them and their parents that were not there, the innermost
-first."""
+_HYDRAS = frozenset({"config.yaml", "hydra.yaml", "overrides.yaml", "multirun.yaml"})
 
 
 class FailedJobs(Callback):
@@ -265,7 +259,7 @@ def _expect(folder: Path) -> None:
     with contextlib.suppress(OSError):  # likewise
         _let_links_go(folder)
         if not path.exists() or path.is_dir() and not any(path.iterdir()):
-            _new_folders.setdefault(path, new)
+            _program.new_folders.setdefault(path, new)
 
 
 def _let_links_go(folder: Path) -> None:
@@ -282,17 +276,16 @@ def _summaries(config: DictConfig) -> list[Path]:
 
 def _clear(folder: Path, new: tuple[Path, ...]) -> None:
     """Remove a folder that holds nothing but what Hydra put there."""
-    files = [path for path in folder.glob("*") if path.name != ".hydra"]
-    inner = list(folder.glob(".hydra/*"))
-    others = [path for path in files if path.suffix != ".log" and path.name != "multirun.yaml"]
-    if others or any(path.name not in _HYDRAS for path in inner):
+    inner = folder / ".hydra"
+    files = [path for path in (*folder.glob("*"), *inner.glob("*")) if path != inner]
+    if any(path.suffix != ".log" and path.name not in _HYDRAS for path in files):
         return
     for handler in list(logging.root.handlers):  # Windows removes no file that is open
         if isinstance(handler, logging.FileHandler) and Path(handler.baseFilename) in files:
             logging.root.removeHandler(handler)
             handler.close()
-    for path in (*files, *inner):
+    for path in files:
         path.unlink()
-    for place in (folder / ".hydra", *new):
+    for place in (inner, *new):
         if place.is_dir():
             place.rmdir()
