@@ -9,7 +9,7 @@ import logging
 import os
 import re
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 
 import hydra
 from hydra.utils import instantiate
@@ -119,13 +119,8 @@ def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> lis
     known = setting_names()
     others: list[str] = []
     files: list[str] = []
-    value_follows = False
-    for argument in _info_joined(arguments):
-        if value_follows or not _is_file(argument, known):
-            others.append(argument)
-            value_follows = not value_follows and argument in _WITH_VALUE
-        else:
-            files.append(argument)
+    for word, is_value in _words(arguments):
+        (others if is_value or not _is_file(word, known) else files).append(word)
     if not files:
         return others
     if "" in files:
@@ -177,29 +172,33 @@ def options_first(arguments: Sequence[str]) -> list[str]:
     """The arguments in the order that Hydra's parser wants: options, and then all overrides."""
     options: list[str] = []
     overrides: list[str] = []
-    value_follows = False
-    for word in _info_joined(arguments):
-        if word.startswith("-") and not value_follows:
-            _check_option(word.partition("=")[0])
-        if not word.startswith("-") and not value_follows:
-            overrides.append(_readable(word))
-        else:
+    for word, is_value in _words(arguments):
+        if is_value:
             options.append(word)
-        value_follows = not value_follows and word in _WITH_VALUE
-    if value_follows:
-        raise ToftrackError(f"{options[-1]} has no value; --hydra-help tells which there are")
+        elif word.startswith("-"):
+            _check_option(word.partition("=")[0])
+            options.append(word)
+        else:
+            overrides.append(_readable(word))
     return [*options, *overrides]
 
 
-def _info_joined(arguments: Sequence[str]) -> list[str]:
-    """The arguments with --info and its value as one word: left out, the next one would be it."""
+def _words(arguments: Sequence[str]) -> Iterator[tuple[str, bool]]:
+    """The arguments, each with whether it is the value of an option; --info and its value are one
+    word: left out, the next one would be it.
+    """
     words: list[str] = []
     for word in arguments:
         if words and words[-1] == "--info=all" and word in _INFO:
             words[-1] = f"--info={word}"
         else:
             words.append("--info=all" if word in ("--info", "-i") else word)
-    return words
+    is_value = False
+    for word in words:
+        yield word, is_value
+        is_value = not is_value and word in _WITH_VALUE
+    if is_value:
+        raise ToftrackError(f"{words[-1]} has no value; --hydra-help tells which there are")
 
 
 def _check_option(word: str) -> None:
