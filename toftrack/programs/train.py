@@ -120,18 +120,15 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
 
 
 def _summary(kind: str, data: PoseData, rows: list[Row], asked: Row) -> dict[str, Any]:
-    figures = {name: getattr(asked, name) for name in ("training", "held_out", "reached")}
+    def plain(row: Row) -> dict[str, Any]:
+        cells = row._asdict().items()
+        return {name: one._asdict() if isinstance(one, Errors) else one for name, one in cells}
+
     found = {
         f"{name}_{unit}": value
-        for name, errors in figures.items()
-        if errors is not None
-        for unit, value in errors._asdict().items()
+        for name, errors in plain(asked).items()
+        if isinstance(errors, dict)
+        for unit, value in errors.items()
     }
-    table = [
-        {
-            key: one._asdict() if isinstance(one, Errors) else one
-            for key, one in row._asdict().items()
-        }
-        for row in rows
-    ]
+    table = list(map(plain, rows))
     return {"kind": kind, "dims": asked.dims, "sources": data.sources, **found, "errors": table}
