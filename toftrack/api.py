@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from toftrack.compute.collector import collector_paused
 from toftrack.configuration.check import check_groups, check_tracker
 from toftrack.configuration.compose import configuration, one_sentence
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_choice
 
 if TYPE_CHECKING:
     import torch
@@ -146,8 +146,7 @@ def compute_device(name: str) -> torch.device:
     """The torch device of compute=auto|cpu|cuda; ToftrackError when there is none of that name."""
     import torch
 
-    if name not in ("auto", "cpu", "cuda"):
-        raise ToftrackError(f"compute={name} is unknown; give auto, cpu or cuda")
+    check_choice("compute", name, ("auto", "cpu", "cuda"))
     if name == "cuda":
         try:
             torch.cuda.init()

@@ -19,7 +19,7 @@ from hydra.core.config_store import ConfigStore
 from omegaconf import OmegaConf
 
 from toftrack.configuration import configuration_folder
-from toftrack.errors import ToftrackError
+from toftrack.errors import reported_errors
 
 _log = logging.getLogger(__name__)
 
@@ -37,6 +37,11 @@ ENTRY_POINTS = {
 """Groups of conf/, and readers of recordings, with what the entry points for them are called."""
 _LIKE = {"detector": "network", "gestures": "default", "pose_space": "pca"}
 """Groups of which an installed part has the settings of a choice of toftrack's, too."""
+IMPORTABLE = (
+    "check the name, and that its module lies in the folder of --config-dir, on PYTHONPATH, or is "
+    "installed"
+)
+"""What to do about a part that cannot be imported."""
 
 
 def installed(group: str) -> dict[str, EntryPoint]:
@@ -95,11 +100,6 @@ def named_object(path: str, named_by: str) -> Any:
 
     named_by: the setting or the entry point, for the error.
     """
-    try:
+    what = f"{named_by} names {path}, which cannot be imported"
+    with reported_errors(what, IMPORTABLE, Exception):  # whatever somebody's module raises
         return pkgutil.resolve_name(path)
-    except Exception as error:  # whatever somebody's module raises
-        reason = " ".join(str(error).split())
-        raise ToftrackError(
-            f"{named_by} names {path}, which cannot be imported ({reason}); check the name, and"
-            " that its module lies in the folder of --config-dir, on PYTHONPATH, or is installed"
-        ) from error

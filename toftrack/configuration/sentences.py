@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 
 from toftrack.configuration import configuration_folder
-from toftrack.configuration.plugins import ENTRY_POINTS, installed
+from toftrack.configuration.plugins import ENTRY_POINTS, IMPORTABLE, installed
 from toftrack.errors import ToftrackError
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
@@ -55,11 +55,8 @@ def sentence(error: BaseException) -> str:
     if any(isinstance(cause, RecursionError) for cause in chain):
         return "a setting or a file is nested too deeply; remove what is not meant"
     if target := re.match(r"Error locating target '([^']+)'", str(error)):
-        return (
-            f"the _target_ {target[1]} cannot be imported ({_one_line(str(chain[-1]))}); check its "
-            "name, and that its module lies in the folder of --config-dir, on PYTHONPATH, or is "
-            "installed"
-        )
+        why = _one_line(str(chain[-1]))
+        return f"the _target_ {target[1]} cannot be imported ({why}); {IMPORTABLE}"
     text = _one_line(str(error))
     if deleted := re.match(r"Key '([^']+)' is not in struct", text):
         return f"the configuration lacks {deleted[1]}; leave ~{deleted[1]} out"
