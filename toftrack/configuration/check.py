@@ -186,21 +186,20 @@ def check_tracker(config: DictConfig, overrides: Sequence[str] = ()) -> None:
         for key, (value, choice) in (_OF_NETWORKS if without else _OF_PAPER).items()
         if OmegaConf.select(config, key) == value
     ]
-    if without and OmegaConf.select(config, "refine.iterations"):
-        given.append("refine=gauss_newton")
+    refined = without and OmegaConf.select(config, "refine.iterations")
+    if refined:
+        said = (word for word in overrides if word.startswith("refine."))
+        given.append(next(said, "refine=gauss_newton"))
     given += [word for word in overrides if without and word.startswith("posterior.")]
     some = ", ".join(given)
     if not given:
         return
-    if without and {"lost=calibrated", "refine=gauss_newton"} <= set(given):
+    if refined and "lost=calibrated" in given:
         raise ToftrackError(
             "detector=none belongs to experiment=paper, the tracker without networks; give"
             " experiment=paper, or leave detector=none out"
         )
     if without:
-        for word in overrides:
-            if word.startswith("refine."):
-                some = some.replace("refine=gauss_newton", word)
         raise ToftrackError(
             f"{some} works only with networks, which experiment=paper lacks; leave {some} out,"
             " or leave experiment=paper out"

@@ -230,11 +230,8 @@ def _unknown_key(key: str, parent: DictConfig) -> str:
         return f"{text} of this {group}; it is one of {group}={', '.join(having)}"
     if likely is not None:
         return f"{text}; did you mean {likely}?"
-    where = key.rpartition(".")[0]
-    while where and not isinstance(OmegaConf.select(root, where), DictConfig):
-        where = where.rpartition(".")[0]
-    inside = OmegaConf.select(root, where) if where else root
-    some = [str(name) for name in inside if name not in ("_target_", "hydra")]
+    where = parent._get_full_key(None)
+    some = [str(name) for name in parent if name not in ("_target_", "hydra")]
     if not some:
         return f"{text}; this {where} has none"
     if len(some) > _MOST:
