@@ -12,7 +12,7 @@ from typing import Any
 
 from toftrack.configuration.compose import searched
 from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import Parser, plain_parser
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -47,7 +47,8 @@ def _speed(arguments: Sequence[str]) -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     counts = list(speed.PARTICLES)
     about = f"how many hypotheses to time ({' '.join(map(str, counts))})"
-    parser.add_argument("--particles", type=int, nargs="+", default=counts, metavar="N", help=about)
+    number = parser.add_number
+    number("--particles", 1, whole=True, nargs="+", default=counts, metavar="N", help=about)
     about = "device that scores (cpu)"
     parser.add_argument("--compute", choices=("cpu", "cuda"), default="cpu", help=about)
     about = "how long to time each method (1)"
@@ -55,8 +56,6 @@ def _speed(arguments: Sequence[str]) -> None:
     parser.add_argument("--frames", action="store_true", help="time whole frames, too")
     parser.add_argument("--no-baselines", action="store_true", help="leave the slow methods out")
     given = parser.parse_args(arguments)
-    if min(given.particles) < 1:
-        parser.error("--particles must be above 0")
     results.checked_targets(given.json)
     baselines = not given.no_baselines
     result = speed.run(given.particles, given.compute, given.seconds, given.frames, baselines)
@@ -68,18 +67,15 @@ def _alternating(arguments: Sequence[str]) -> None:
     from toftrack.evaluation import alternating, results
 
     parser = plain_parser("toftrack benchmark alternating", alternating.__doc__)
-    parser.add_argument(
-        "--rounds", type=int, default=5, help="rounds of all programs (5); 0 = none"
-    )
-    parser.add_argument("--starts", type=int, default=0, help="starts to time (0)")
-    parser.add_argument("--cores", type=int, help="how many all may use, if it can be set")
+    about = "rounds of all programs (5); 0 = none"
+    parser.add_number("--rounds", 0, whole=True, default=5, help=about)
+    parser.add_number("--starts", 0, whole=True, default=0, help="starts to time (0)")
+    parser.add_number("--cores", 1, whole=True, help="how many all may use, if it can be set")
     about = "recordings with truth of two hands"
     parser.add_argument("--two-hands", nargs="+", default=[], metavar="RECORDING", help=about)
     parser.add_argument("--peer-python", metavar="PYTHON", help="Python of MediaPipe's environment")
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures there, too")
     given = parser.parse_args(arguments)
-    if min(given.rounds, given.starts) < 0 or (given.cores or 1) < 1:
-        parser.error("--rounds and --starts must be 0 or more, --cores 1 or more")
     results.checked_targets(given.json)
     result = alternating.measure(
         given.rounds, given.starts, given.cores, given.two_hands, given.peer_python
@@ -131,7 +127,7 @@ def _ablation(arguments: Sequence[str]) -> None:
     accuracy.ablate(_options(parser, arguments), command)
 
 
-def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentParser:
+def _parser_of_recordings(name: str, about: str | None) -> Parser:
     """With what accuracy and ablation have in common."""
     parser = plain_parser(f"toftrack benchmark {name}", about)
     about = "folders of recordings, or recordings; KEY=VALUE is an override as for track.py"
@@ -139,7 +135,8 @@ def _parser_of_recordings(name: str, about: str | None) -> argparse.ArgumentPars
     parser.add_argument("--seeds", type=_seeds, default=[0], help="seeds, separated by commas (0)")
     parser.add_argument("--config-dir", help="folder of choices of your own (docs/extending.md)")
     about = "processes (1); does not change the figures"
-    parser.add_argument("--workers", type=_workers, default=1, metavar="N", help=about)
+    most = 4 * (os.cpu_count() or 1)
+    parser.add_number("--workers", 1, most, whole=True, default=1, metavar="N", help=about)
     parser.add_argument("--json", type=Path, metavar="FILE", help="write all results there")
     parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the tables there")
     return parser
@@ -157,13 +154,6 @@ def _seeds(text: str) -> list[int]:
     if not all(map(str.isdecimal, seeds)):
         raise argparse.ArgumentTypeError(f"'{text}' must be whole numbers from 0 on, as 0,1,2")
     return list(map(int, seeds))
-
-
-def _workers(text: str) -> int:
-    most = 4 * (os.cpu_count() or 1)
-    if not (text.isdecimal() and 1 <= int(text) <= most):
-        raise argparse.ArgumentTypeError(f"'{text}' must be a whole number from 1 to {most}")
-    return int(text)
 
 
 def _write_picture(path: Path, result: dict[str, Any]) -> None:

@@ -44,23 +44,20 @@ _SEARCHED = 24
 def main(arguments: Sequence[str]) -> None:
     """Parse the command line, calibrate, and write the files. Raises ToftrackError."""
     parser = plain_parser("toftrack calibrate", __doc__)
-    add = parser.add_argument
+    add, number = parser.add_argument, parser.add_number
     add("recording", help=".srs, .npz with amplitude, or a folder")
     add("--board", required=True, help="inner corners, columns x rows, as 7x5")
-    add("--square", required=True, type=float, help="side of a square, m")
+    metres = ", in metres (0.03 for 30 mm)"
+    number("--square", 0, 0.99, remedy=metres, required=True, help="side of a square, m")
     add("--out", default="camera.json", help="the camera file to write")
     add("--report", help="folder of report and pictures (default: beside OUT)")
     add("--camera", help="camera file to start from instead of the recording's")
     add("--keep-lens", action="store_true", help="correct the depth only, trust the lens")
-    add("--frames", type=int, default=80, help="use at most this many (80)")
+    number("--frames", 1, whole=True, default=80, help="use at most this many (80)")
     mhz, about = DEFAULT_MODULATION_MHZ, "MHz, of a .srs that does not state its range"
     add("--modulation", type=int, default=mhz, help=about)
     options = parser.parse_args(arguments)
     board, square_m = _board(options.board), options.square
-    if not 0 < square_m < 1 or options.frames < 1:
-        raise ToftrackError(
-            f"--square must be metres (0.03 for 30 mm), not {square_m}, and --frames above 0"
-        )
     out = Path(options.out).expanduser()
     with reported_errors(f"the camera file '{out}' cannot be written", "choose another place"):
         check_replaceable(out)  # before minutes of work

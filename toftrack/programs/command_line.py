@@ -31,7 +31,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.check import check_interpolations, check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, place_of, sentence
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_number
 from toftrack.files.json_text import read_object
 from toftrack.files.safe_files import leave_folder, let_links_go, write_whole
 from toftrack.output.files import own_folder
@@ -107,12 +107,10 @@ def run(main: Callable[[], object]) -> int:
     return status if isinstance(status, int) else 0
 
 
-def plain_parser(
-    program: str, about: str | None, usage: str | None = None
-) -> argparse.ArgumentParser:
+def plain_parser(program: str, about: str | None, usage: str | None = None) -> Parser:
     """A parser whose help shows a text, of several lines, as it stands."""
     kind = argparse.RawDescriptionHelpFormatter
-    return _Parser(program, usage, about, formatter_class=kind)
+    return Parser(program, usage, about, formatter_class=kind)
 
 
 def typed(words: Sequence[str]) -> str:
@@ -120,8 +118,24 @@ def typed(words: Sequence[str]) -> str:
     return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
     """Says what is wrong in one sentence, without all that there is."""
+
+    def add_number(
+        self, name: str, *bounds: float, whole: bool = False, remedy: str = "", **more: Any
+    ) -> None:
+        """Add an option with a number within bounds, as `check_number` has them; one that need not
+        be whole must be above the lower one.
+        """
+
+        def number(text: str) -> Any:
+            value: Any = text
+            with contextlib.suppress(ValueError):
+                value = int(text) if whole else float(text)
+            check_number(name, value, *bounds, above=not whole, whole=whole, remedy=remedy)
+            return value
+
+        self.add_argument(name, type=number, **more)
 
     def error(self, message: str) -> NoReturn:
         unknown = re.match(r"unrecognized arguments: (--[^\s=]+)", message)

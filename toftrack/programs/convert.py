@@ -45,7 +45,8 @@ def main(arguments: Sequence[str]) -> None:
     add("--camera", help="camera file instead of the recording's own camera")
     about = "MHz of the SR3000: gives the range of a .srs, of IN (if it states none) or of OUT"
     add("--modulation", type=int, default=DEFAULT_MODULATION_MHZ, help=about)
-    add("--unit", type=float, help="metres of one step of the PNG images to write")
+    about = "metres of one step of the PNG images to write"
+    parser.add_number("--unit", 0, 0.99, help=about)
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--topic", help="topic of the depth images in a ROS bag that has several")
     names = ("FX", "FY", "CX", "CY")
@@ -81,8 +82,6 @@ def convert(
     Raises ToftrackError: the source cannot be read, the target not be written, or it exists.
     """
     target = Path(target).expanduser()
-    if unit_m is not None and not 0 < unit_m < 1:
-        raise ToftrackError(f"--unit must be above 0 and below 1 m, not {unit_m}")
     kind = target.suffix.lower()
     if kind not in (".srs", ".npz", "") and not target.is_dir():
         raise ToftrackError(

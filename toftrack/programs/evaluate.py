@@ -25,7 +25,8 @@ def main(arguments: Sequence[str]) -> None:
     add("overrides", metavar="OVERRIDE", nargs="*", default=[], help=about)
     add("--config-dir", help="folder of choices of your own (docs/extending.md)")
     add("--sequences", help="only these, by name, separated by commas: P0/1,P0/2")
-    add("--frames", type=_count, help="only this many at the start of each sequence")
+    about = "only this many at the start of each sequence"
+    parser.add_number("--frames", 1, whole=True, help=about)
     about = "how far the labels' fingertips lie inside ours, instead of what the data set gives"
     add("--tip-inset", type=float, metavar="MM", help=about)
     add("--json", type=Path, metavar="FILE", help="write the figures here, too")
@@ -52,12 +53,6 @@ def main(arguments: Sequence[str]) -> None:
     print(table(figures))
     print(f"compared: {', '.join(JOINT_NAMES[row] for row in data_set.joints)}")
     print(f"tips: {data_set.tips}; ours are moved {1e3 * inset_m:g} mm inwards")
-
-
-def _count(text: str) -> int:
-    if not (text.isdecimal() and int(text) > 0):
-        raise ToftrackError(f"--frames {text} must be a whole number above 0")
-    return int(text)
 
 
 def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[LabelledSequence]:

@@ -24,7 +24,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.base import Device
-from toftrack.errors import ToftrackError, check_number
+from toftrack.errors import ToftrackError
 from toftrack.evaluation.labelling import LabelFile, chosen_frames, label_frames, track
 from toftrack.evaluation.results import checked_targets
 from toftrack.gestures.recognition import Gestures
@@ -50,19 +50,18 @@ _OF_CONVERT = {
 def main(arguments: Sequence[str]) -> None:
     """Parse the command line and serve the page until Ctrl-C. Raises ToftrackError."""
     parser = plain_parser("toftrack label", __doc__)
-    add = parser.add_argument
+    add, number = parser.add_argument, parser.add_number
     about = "the recording, and KEY=VALUE settings for it, as for toftrack track"
     add("words", nargs="*", default=[], metavar="FILE", help=about)
-    add("--frames", type=int, help=f"how many to label ({_FRAMES}, or those in the output)")
+    about = f"how many to label ({_FRAMES}, or those in the output)"
+    number("--frames", 1, whole=True, help=about)
     add("--least-sure", action="store_true", help="show the frames where the tracker is least sure")
     add("--output", default="labels.json", help="the file to write (labels.json)")
     add("--side", choices=("right", "left"), help="which hand it is; the page asks, too")
-    add("--port", type=int, default=0, help="port of the page (any free one)")
+    about = "port of the page (any free one)"
+    number("--port", 0, 65535, whole=True, remedy=ANY_PORT, default=0, help=about)
     add("--no-browser", action="store_true", help="only print the address")
     options = parser.parse_intermixed_args(arguments)
-    if options.frames is not None:
-        check_number("--frames", options.frames, 1, whole=True)
-    check_number("--port", options.port, 0, 65535, whole=True, remedy=ANY_PORT)
     words = with_recording(options.words)
     if not any(word.startswith("device=") for word in words):
         raise ToftrackError("which recording is to be labelled? Give the name of a file")

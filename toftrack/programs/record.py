@@ -24,7 +24,7 @@ from toftrack.configuration import configuration_folder
 from toftrack.configuration.compose import configuration, one_sentence, searched
 from toftrack.devices.base import Device, frames_of
 from toftrack.devices.sr3000.device import Sr3000
-from toftrack.errors import ToftrackError, check_number
+from toftrack.errors import ToftrackError
 from toftrack.programs import shutdown
 from toftrack.programs.command_line import plain_parser
 from toftrack.programs.shutdown import EndedError
@@ -39,10 +39,11 @@ def main(arguments: Sequence[str]) -> None:
     parser = plain_parser("toftrack record", __doc__)
     add, folder = parser.add_argument, configuration_folder()
     add("out", metavar="OUT", help="the new recording, .npz or .srs")
-    add("--frames", type=int, help="stop after this many (default: at Ctrl-C)")
-    add("--seconds", type=float, help="stop after this time")
+    about = "stop after this many (default: at Ctrl-C)"
+    parser.add_number("--frames", 1, whole=True, help=about)
+    parser.add_number("--seconds", 0, help="stop after this time")
     about = "stop at this size (default: 1, none with --frames or --seconds)"
-    add("--limit", type=float, metavar="GB", help=about)
+    parser.add_number("--limit", 0, metavar="GB", help=about)
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--conf", default=folder, help="folder of the configuration")
     add("--config-dir", help="folder of choices of your own")
@@ -52,9 +53,6 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_intermixed_args(arguments)
     words = sorted([options.out, *options.overrides], key=lambda word: "=" in word)
     options.out, *options.overrides = words
-    for name, whole in (("frames", True), ("seconds", False), ("limit", False)):
-        if (value := getattr(options, name)) is not None:
-            check_number(f"--{name}", value, 0, above=True, whole=whole)
     suffix = Path(options.out).suffix.lower()
     if suffix not in (".npz", ".srs"):
         raise ToftrackError(
