@@ -113,6 +113,12 @@ def plain_parser(program: str, about: str | None, usage: str | None = None) -> P
     return Parser(program, usage, about, formatter_class=kind)
 
 
+def note(text: str) -> None:
+    """Say what speaks against a result but is no error; of a sweep summary.json tells it."""
+    if not in_sweep():
+        shutdown.say(f"note: {text}", sys.stderr)
+
+
 def typed(words: Sequence[str]) -> str:
     """A command as it is typed: the shells of Windows know other quotes."""
     return subprocess.list2cmdline(words) if os.name == "nt" else shlex.join(words)

@@ -20,7 +20,7 @@ from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import whole_file
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import note, plain_parser
 from toftrack.recordings.bare import MILLIMETRE, NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.image_folder import write_image_folder
@@ -95,11 +95,11 @@ def convert(
         )
     with closing(open_recording(source, given)) as store:
         if store.truth is not None and kind != ".npz":
-            _warn("the ground truth has no place in the new format and is left out")
+            note("the ground truth has no place in the new format and is left out")
         if damage := store.damage:
-            _warn(f"{source}: {damage}; the frames before are converted")
+            note(f"{source}: {damage}; the frames before are converted")
         if store.left_out:
-            _warn(f"{source}: {store.left_out}")
+            note(f"{source}: {store.left_out}")
         with tqdm(total=len(store), unit=" frames", file=sys.stderr, disable=None) as bar:
             if kind == ".npz":
                 write_recording(target, store, bar.update)
@@ -130,7 +130,3 @@ def _to_srs(store: FrameStore, target: Path, range_m: float, bar: tqdm) -> None:
                 data = encode_frame(radial, amplitude, range_m)
             stream.write(srs_frame(data, float(time_s)))
             bar.update()
-
-
-def _warn(text: str) -> None:
-    print(f"note: {text}", file=sys.stderr)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import io
-import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
@@ -26,7 +25,7 @@ from toftrack.hand.skeleton import ANGLE_NAMES
 from toftrack.output.exports import HandMotion, glb_of, motions_of
 from toftrack.output.lines import DROPPED
 from toftrack.output.run_folder import read_run
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import note, plain_parser
 
 FORMATS = ("glb", "bvh", "csv")
 
@@ -57,9 +56,7 @@ def export(folder: Path, kind: str) -> list[Path]:
         else:  # a file has one skeleton
             steps_s = np.diff(motions[0].time_s)
             if len(steps_s) and steps_s.max() > _UNEVEN * np.median(steps_s):
-                print(
-                    "note: frames are not evenly spaced, which a .bvh cannot say", file=sys.stderr
-                )
+                note("frames are not evenly spaced, which a .bvh cannot say")
             slots = {motion.slot: [bvh_of(motion).encode()] for motion in motions}
             several = len(run.shapes) > 1
             contents = {f"hand{slot + 1 if several else ''}.bvh": c for slot, c in slots.items()}

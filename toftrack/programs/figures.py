@@ -28,7 +28,7 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import make_folder
 from toftrack.frames.frame import Truth
 from toftrack.output.run_folder import Footage, Run, read_run
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import note, plain_parser
 from toftrack.views.figures.chart import new_figure, write_figures
 from toftrack.views.figures.runs import (
     course_figure,
@@ -69,10 +69,9 @@ def draw_figures(
     if footage is None:
         if recording is None and frame is not None:
             raise ToftrackError("a run with a live camera has no images to draw --frame from")
-        print(
-            "note: the run tracked a live camera, whose images are not kept; only the figures "
-            "without them are drawn",
-            file=sys.stderr,
+        note(
+            "the run tracked a live camera, whose images are not kept; only the figures without "
+            "them are drawn"
         )
     every = range(len(run.shapes))
     # Those that had a hand; the first one where none had.

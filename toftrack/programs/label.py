@@ -31,7 +31,7 @@ from toftrack.gestures.recognition import Gestures
 from toftrack.output.web.server import ANY_PORT, wait
 from toftrack.programs import shutdown
 from toftrack.programs.applications import with_recording
-from toftrack.programs.command_line import plain_parser, typed
+from toftrack.programs.command_line import note, plain_parser, typed
 from toftrack.views.labelling.page import LabelPage
 
 _FRAMES = 20
@@ -97,8 +97,7 @@ def _page(device: Device, config: DictConfig, path: Path, options: argparse.Name
     checked_targets(target)
     labels = LabelFile(target, path.name, (camera.width, camera.height), count, options.side)
     if device.truth is not None:
-        note = "holds truth; the benchmark measures by that, not by labels"
-        print(f"note: '{path}' {note}", file=sys.stderr)
+        note(f"'{path}' holds truth; the benchmark measures by that, not by labels")
     known = track(device, config) if options.least_sure else None
     given = labels.numbers()
     numbers = chosen_frames(

@@ -8,7 +8,6 @@ in FILE.npz.part.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from contextlib import closing, suppress
 from pathlib import Path
@@ -22,7 +21,7 @@ from toftrack.output.files import LINES, WHOLE_FILES, cut_unfinished_line, locke
 from toftrack.output.results import count_frames, finish, read_results, read_run_facts, records_of
 from toftrack.output.run_folder import found_again, open_tracked
 from toftrack.output.summary import metrics_table
-from toftrack.programs.command_line import plain_parser
+from toftrack.programs.command_line import note, plain_parser
 from toftrack.recordings.store import open_source
 from toftrack.recordings.unfinished import is_recording, recover_recording
 from toftrack.views.overlay import VIDEO
@@ -126,5 +125,5 @@ def _truth(facts: dict[str, Any], recording: str | Path | None) -> Truth | None:
         if recording is not None:
             raise
         why = str(error)
-    print(f"note: no metrics, because {why}", file=sys.stderr)
+    note(f"no metrics, because {why}")
     return None

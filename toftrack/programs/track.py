@@ -36,7 +36,7 @@ from toftrack.output.smoothing import OneEuro, SmoothState, smooth
 from toftrack.output.stream import ReaderGoneError, Stream
 from toftrack.output.summary import metrics_line, metrics_table, shape_file
 from toftrack.programs import shutdown
-from toftrack.programs.command_line import in_sweep, job_words
+from toftrack.programs.command_line import in_sweep, job_words, note
 from toftrack.recordings.recorder import Recorder
 from toftrack.render.likelihood import FMeasure
 from toftrack.tracking.paper import PaperModel
@@ -60,7 +60,7 @@ def track(config: DictConfig, device: Device) -> float:
             return _track(config, folder, run)
         finally:  # a live run that lost the hand ends by an interruption
             for sentence in run.notes():
-                _note(sentence)
+                note(sentence)
 
 
 @contextmanager
@@ -118,10 +118,10 @@ def _track(config: DictConfig, folder: Path, run: Run) -> float:
     said = metadata["device"].get("doubts", ())  # by the device itself
     for doubt in summary.get("doubts", ()):
         if doubt not in said:
-            _note(doubt)
+            note(doubt)
     threshold, score = config.lost.get("score"), summary.get("mean_score")
     if None not in (threshold, score) and 2 * summary["lost_frames"] > summary["frames"]:
-        _note(
+        note(
             f"the mean score is {score:.2f}, and a frame below lost.score={threshold:g}, made for"
             " the F-measure, is lost; lower that if the picture shows a hand that is followed"
         )
@@ -298,12 +298,6 @@ def _report(
         shutdown.say("\n".join([f"results: {folder}", *lines]), sys.stdout)
     if recorder is not None and recorder.words():
         shutdown.say(f"  {recorder.words()}", sys.stdout)
-
-
-def _note(sentence: str) -> None:
-    """What speaks against the run or its result; of a sweep summary.json tells it."""
-    if not in_sweep():
-        shutdown.say(f"note: {sentence}", sys.stderr)
 
 
 def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> dict[str, Any]:
