@@ -48,9 +48,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
     Raises ToftrackError when it cannot be composed.
     """
-    folder = (
-        configuration_folder() if config_dir is None else Path(config_dir).expanduser().resolve()
-    )
+    folder = Path(config_dir or configuration_folder()).expanduser().resolve()
     if not (folder / _ROOT).is_file():
         if any(folder.glob("*/*.yaml")):
             return configuration(searched(folder), *overrides)
@@ -76,9 +74,7 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
         name = _ROOT.removesuffix(".yaml")
         try:
             config = compose(name, overrides=list(overrides))
-        except (HydraException, OmegaConfBaseException, ToftrackError):
-            raise
-        except Exception as error:  # whatever the readers of YAML say of somebody's file
+        except Exception as error:  # also whatever the readers of YAML say of somebody's file
             raise ToftrackError(sentence(error)) from error
         check_overrides(config, name, overrides)
         return config

@@ -235,12 +235,10 @@ class FailedJobs(Callback):
         self._before: dict[Path, int] = {}
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
-        # Before Hydra writes: two runs that begin together would share, or clear, one folder.
-        _expect(_given(config, "run"))
+        _begin(config, "run")
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        folder = _given(config, "sweep")
-        _expect(folder)
+        folder = _begin(config, "sweep")
         for job in folder.iterdir() if os.path.isdir(folder) else ():
             let_links_go(job)
             _let_links_go(job)
@@ -252,34 +250,28 @@ class FailedJobs(Callback):
                 _program.failed_jobs.add(path.parent)
 
 
-def _given(config: DictConfig, kind: str) -> Path:
+def _begin(config: DictConfig, kind: str) -> Path:
+    """Before Hydra makes the folder of a run or a sweep: have it for oneself, for two that begin
+    together would share, or clear, it. One with files in it is nobody's to clear.
+    """
     try:
         check_interpolations(config)
         if not (folder := config.hydra[kind].dir):  # which would be the current one
             raise ToftrackError(
                 f"hydra.{kind}.dir is empty; give a folder, or . for the current one"
             )
-    except ToftrackError as error:
-        raise _JobFailedError(error) from error
-    return Path(folder)
-
-
-def _expect(folder: Path) -> None:
-    """A run or a sweep is about to make this folder, which it has for itself. One with files in it
-    is nobody's to clear.
-    """
-    path = folder.absolute()
-    new = tuple(place for place in (path, *path.parents) if not os.path.exists(place))
-    try:
+        path = Path(folder).absolute()
+        new = tuple(place for place in (path, *path.parents) if not os.path.exists(place))
         with contextlib.suppress(OSError):  # Hydra will say it, too
             if _program.running and (lock := own_folder(path)) is not None:
                 _program.locks.append(lock)
     except ToftrackError as error:
         raise _JobFailedError(error) from error
     with contextlib.suppress(OSError):  # likewise
-        _let_links_go(folder)
+        _let_links_go(path)
         if not path.exists() or path.is_dir() and not any(path.iterdir()):
             _program.new_folders.setdefault(path, new)
+    return path
 
 
 def _let_links_go(folder: Path) -> None:
