@@ -190,7 +190,7 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
 @pytest.mark.parametrize(
     ("words", "reported"),
     [
-        (["device=sample"], "only a recording with a file"),
+        (["device=sample"], "which recording is to be labelled?"),
         (["seed=1"], "which recording is to be labelled?"),
         (["gone.npz"], "no file 'gone.npz'"),
         (["OWN", "--frames", "0"], "--frames=0"),

@@ -7,7 +7,6 @@ known and those in the file; `remove` takes a gesture out of it.
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -107,16 +106,11 @@ def _track(
     """Joint angles, (T, 21) rad, and which frames are believed, (T,), of a part of a recording."""
     begin_s, end_s = part_s
     times = np.asarray(frames.timestamp_s) - frames.timestamp_s[0]
-    if not 0 <= begin_s < end_s < math.inf:
-        raise ToftrackError(
-            f"--from {begin_s:g} --to {end_s:g} is no part of a recording; give seconds from its"
-            " beginning, with --to after --from"
-        )
     rows = np.flatnonzero((times >= begin_s) & (times <= end_s))
-    if end_s > times[-1] + 1 / frames.fps or not len(rows):
+    if not 0 <= begin_s < end_s <= times[-1] + 1 / frames.fps or not len(rows):
         raise ToftrackError(
-            f"--from {begin_s:g} --to {end_s:g} is not within '{recording}', which lasts"
-            f" {times[-1]:.2f} s; give seconds from its beginning"
+            f"--from {begin_s:g} --to {end_s:g} is no part of '{recording}', which lasts"
+            f" {times[-1]:.2f} s; give seconds from its beginning, with --to after --from"
         )
     with one_sentence():
         tracker = build_tracker(configuration("gestures=none", *overrides))

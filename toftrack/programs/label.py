@@ -63,15 +63,11 @@ def main(arguments: Sequence[str]) -> None:
     add("--no-browser", action="store_true", help="only print the address")
     options = parser.parse_intermixed_args(arguments)
     words = with_recording(options.words)
-    if not any(word.startswith("device=") for word in words):
-        raise ToftrackError("which recording is to be labelled? Give the name of a file")
     side = [] if options.side is None else [f"hand.side={options.side}"]
     config = configuration(*side, *words)
     path = config.device.get("path")
     if path is None:
-        raise ToftrackError(
-            "only a recording with a file of its own can be labelled; give the file's name"
-        )
+        raise ToftrackError("which recording is to be labelled? Give the name of its file")
     with one_sentence():
         device: Device = instantiate(config.device)
     with device, closing(_page(device, config, Path(path), options)) as page:
