@@ -105,13 +105,13 @@ def _read_run(path: Path, folder: Path) -> Run:
         return Run(name, {}, {}, f"its overrides cannot be read ({type(error).__name__})")
     try:
         summary = read_json(path / "summary.json")
+        if not isinstance(summary, dict):
+            raise ValueError("it is not one of track.py")
     except FileNotFoundError:
         return Run(name, overrides, {}, "it left no summary.json: it did not finish")
     except (OSError, ValueError) as error:
         why = f"its summary.json cannot be read ({_printable(str(error))})"
         return Run(name, overrides, {}, why)
-    if not isinstance(summary, dict):
-        return Run(name, overrides, {}, "its summary.json is not one of track.py")
     told = summary.get("error")
     complete = summary.get("complete") is not False
     failed = None if told is None else _printable(str(told))
@@ -186,9 +186,7 @@ def _parts(runs: Sequence[Run], key: str) -> dict[str, list[Run]]:
 def _short_names(paths: Sequence[str]) -> list[str]:
     """Recordings as a table tells them apart: without what all folders share, and endings."""
     names = [(*Path(path).parent.parts, Path(path).stem) for path in paths]
-    shared = 0
-    while all(len(name) > shared + 1 and name[shared] == names[0][shared] for name in names):
-        shared += 1
+    shared = len(os.path.commonprefix([name[:-1] for name in names]))
     short = ["/".join(name[shared:]).replace("//", "/") for name in names]
     return [
         name + Path(path).suffix if short.count(name) > 1 else name
