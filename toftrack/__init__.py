@@ -57,29 +57,23 @@ if TYPE_CHECKING:
     __version__: str
 
 # Imported when they are first asked for: torch takes seconds, and not every program needs it.
-_PLACES = {
-    "ANGLE_NAMES": "toftrack.hand.skeleton",
-    "BaseDevice": "toftrack.devices.base",
-    "Camera": "toftrack.frames.camera",
-    "Estimate": "toftrack.frames.estimate",
-    "Frame": "toftrack.frames.frame",
-    "JOINT_NAMES": "toftrack.hand.skeleton",
-    "OPENXR_JOINT_NAMES": "toftrack.hand.openxr",
-    "PushDevice": "toftrack.devices.pushed",
-    "Results": "toftrack.programs.in_python",
-    "Run": "toftrack.output.run_folder",
-    "ToftrackError": "toftrack.errors",
-    "HandsTracker": "toftrack.tracking.tracker",
-    "Tracker": "toftrack.tracking.tracker",
-    "Tracking": "toftrack.programs.in_python",
-    "draw": "toftrack.views.overlay",
-    "make_device": "toftrack.api",
-    "make_hands_tracker": "toftrack.api",
-    "make_tracker": "toftrack.api",
-    "read_results": "toftrack.output.results",
-    "read_run": "toftrack.output.run_folder",
-    "track": "toftrack.programs.in_python",
+_MODULES = {
+    "api": "make_device make_hands_tracker make_tracker",
+    "devices.base": "BaseDevice",
+    "devices.pushed": "PushDevice",
+    "errors": "ToftrackError",
+    "frames.camera": "Camera",
+    "frames.estimate": "Estimate",
+    "frames.frame": "Frame",
+    "hand.openxr": "OPENXR_JOINT_NAMES",
+    "hand.skeleton": "ANGLE_NAMES JOINT_NAMES",
+    "output.results": "read_results",
+    "output.run_folder": "Run read_run",
+    "programs.in_python": "Results Tracking track",
+    "tracking.tracker": "HandsTracker Tracker",
+    "views.overlay": "draw",
 }
+_PLACES = {name: f"toftrack.{place}" for place, it in _MODULES.items() for name in it.split()}
 
 if not TYPE_CHECKING:  # checkers would take any name for one of ours, and find none in `import *`
     __all__ = sorted((*_PLACES, "__version__"))
