@@ -5,14 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from toftrack.configuration.compose import searched
 from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
-from toftrack.programs.command_line import Parser, plain_parser
+from toftrack.programs.command_line import Parser, plain_parser, typed
 
 
 def main(arguments: Sequence[str]) -> None:
@@ -103,7 +102,7 @@ def _accuracy(arguments: Sequence[str]) -> None:
         "--peer-python", type=Path, metavar="PYTHON", help="Python of its environment"
     )
     parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the shares there (.png)")
-    command = shlex.join(["toftrack", "benchmark", "accuracy", *arguments])
+    command = typed(["toftrack", "benchmark", "accuracy", *arguments])
     accuracy.measure(_options(parser, arguments), command, _write_picture)
 
 
@@ -123,7 +122,7 @@ def _ablation(arguments: Sequence[str]) -> None:
     parser = _parser_of_recordings("ablation", accuracy.ABLATION)
     about = f"only some, separated by commas: {', '.join(known)}"
     parser.add_argument("--variants", type=variants, default=known, metavar="NAMES", help=about)
-    command = shlex.join(["toftrack", "benchmark", "ablation", *arguments])
+    command = typed(["toftrack", "benchmark", "ablation", *arguments])
     accuracy.ablate(_options(parser, arguments), command)
 
 

@@ -19,7 +19,7 @@ import shlex
 import subprocess
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
@@ -71,9 +71,11 @@ def run(main: Callable[[], object]) -> int:
     status.
     """
     global _program
-    _program = program = _Program(running=True, tracebacks=os.environ.get(FULL_ERROR) == "1")
+    before = os.environ.get(FULL_ERROR)
+    os.environ[FULL_ERROR] = "1"  # without it, Hydra prints errors and exits by itself
+    _program = program = _Program(running=True, tracebacks=before == "1")
     try:
-        with shutdown.obeyed(), _hydra_raises():
+        with shutdown.obeyed():
             status = main()
             program.new_folders.clear()
     except KeyboardInterrupt as end:
@@ -101,6 +103,9 @@ def run(main: Callable[[], object]) -> int:
         for lock in program.locks:
             leave_folder(lock)
         _program = _Program()
+        del os.environ[FULL_ERROR]
+        if before is not None:
+            os.environ[FULL_ERROR] = before
     if program.failed_jobs:
         print(f"error: {len(program.failed_jobs)} of the jobs failed, see above", file=sys.stderr)
         return 1
@@ -182,20 +187,6 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
             return math.inf
 
     return guarded
-
-
-@contextlib.contextmanager
-def _hydra_raises() -> Iterator[None]:
-    """Hydra prints errors and exits by itself, unless it believes that the user wants them raw."""
-    before = os.environ.get(FULL_ERROR)
-    os.environ[FULL_ERROR] = "1"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[FULL_ERROR]
-        else:
-            os.environ[FULL_ERROR] = before
 
 
 def in_sweep() -> bool:
