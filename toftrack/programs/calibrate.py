@@ -32,7 +32,6 @@ from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
 from toftrack.recordings.store import open_with_own_camera
 from toftrack.views.figures import chart
-from toftrack.views.figures.chart import write_figures
 from toftrack.views.pictures import write_picture
 
 _PICTURES = 12
@@ -193,7 +192,7 @@ def _write_report(
         write_whole(folder / "report.txt", text + "\n")
         write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
         write_picture(folder / "corners.png", sheet)
-        write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
+        chart.write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
 
 
 def _board(text: str) -> tuple[int, int]:

@@ -56,13 +56,11 @@ def main(arguments: Sequence[str]) -> None:
     add("--fps", type=float, help="frames per second of images without times (25)")
     add("--dataset", help="name of the depth stack in a .h5 or .mat that has several")
     options = parser.parse_args(arguments)
-    lens = None if options.intrinsics is None else tuple(options.intrinsics)
     given = Given(
-        *(lens, options.source_unit, options.fps, options.dataset),
+        *(options.intrinsics, options.source_unit, options.fps, options.dataset),
         *(options.camera, options.topic, options.modulation),
     )
-    written = options.unit, options.overwrite
-    count = convert(options.source, options.target, given, *written)
+    count = convert(options.source, options.target, given, options.unit, options.overwrite)
     print(f"{options.target}: {count} frames")
 
 
