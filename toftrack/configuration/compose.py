@@ -26,7 +26,7 @@ from toftrack.configuration.plugins import import_from, offer_installed
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError
 
-_ROOT = "config.yaml"
+_ROOT = Path("config.yaml")
 _MOST_LETTERS = 2**16
 """In a file of the configuration."""
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -71,12 +71,11 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
         modest_files(),
         initialize_config_dir(str(folder), version_base="1.3"),
     ):
-        name = _ROOT.removesuffix(".yaml")
         try:
-            config = compose(name, overrides=list(overrides))
+            config = compose(_ROOT.stem, overrides=list(overrides))
         except Exception as error:  # also whatever the readers of YAML say of somebody's file
             raise ToftrackError(sentence(error)) from error
-        check_overrides(config, name, overrides)
+        check_overrides(config, _ROOT.stem, overrides)
         return config
 
 
@@ -186,7 +185,5 @@ def one_sentence() -> Iterator[None]:
     """Hydra wraps errors, those of ToftrackError too; callers get one they can catch and show."""
     try:
         yield
-    except ToftrackError:
-        raise
     except (HydraException, OmegaConfBaseException) as error:
         raise ToftrackError(sentence(error)) from error
