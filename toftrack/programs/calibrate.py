@@ -89,7 +89,13 @@ def main(arguments: Sequence[str]) -> None:
     camera.save(out)
     facts = _facts(start, camera, lens, pairs, found, len(numbers))
     text = _report(facts)
-    _write_report(folder, lens, [amplitude for _, amplitude in images], facts, text, board)
+    what = f"the report folder '{folder}' cannot be written"
+    with reported_errors(what, "choose another with --report"):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_whole(folder / "report.txt", text + "\n")
+        write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
+        write_picture(folder / "corners.png", _corner_sheet(lens.views, images, board))
+        chart.write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
     print(text)
     print(f"camera file: {out}\nreport:      {folder}")
 
@@ -175,26 +181,6 @@ def _facts(
     }
 
 
-def _write_report(
-    folder: Path,
-    lens: Lens,
-    amplitudes: Sequence[np.ndarray],
-    facts: dict[str, Any],
-    text: str,
-    board: tuple[int, int],
-) -> None:
-    views = lens.views
-    chosen = np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int))
-    sheet = _corner_sheet([(amplitudes[i], views[i].corners_px) for i in chosen], board)
-    what = f"the report folder '{folder}' cannot be written"
-    with reported_errors(what, "choose another with --report"):
-        folder.mkdir(parents=True, exist_ok=True)
-        write_whole(folder / "report.txt", text + "\n")
-        write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
-        write_picture(folder / "corners.png", sheet)
-        chart.write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
-
-
 def _board(text: str) -> tuple[int, int]:
     parts = text.lower().split("x")
     if len(parts) == 2 and all(part.isdecimal() for part in parts):
@@ -208,20 +194,19 @@ def _board(text: str) -> tuple[int, int]:
 
 
 def _corner_sheet(
-    images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int]
+    views: Sequence[View], images: Sequence[tuple[np.ndarray, np.ndarray]], board: tuple[int, int]
 ) -> np.ndarray:
-    """(H, W, 3) uint8 BGR: (H, W) amplitude images with their (n, 2) corners drawn in."""
+    """(H, W, 3) uint8 BGR: some of the images' amplitudes, (H, W), with the corners drawn in."""
     columns, scale, tiles = 4, 2, []
-    for amplitude, corners in images:
-        root = np.sqrt(amplitude.astype(np.float32))
+    for at in np.unique(np.linspace(0, len(views) - 1, _PICTURES).round().astype(int)):
+        root = np.sqrt(images[at][1].astype(np.float32))
         grey = (255 * root / max(float(root.max()), 1.0)).astype(np.uint8)
         shown = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
         tile = cv2.cvtColor(shown, cv2.COLOR_GRAY2BGR)
-        places = ((corners + 0.5) * scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
+        places = ((views[at].corners_px + 0.5) * scale - 0.5).astype(np.float32).reshape(-1, 1, 2)
         cv2.drawChessboardCorners(tile, board, places, True)
         tiles.append(tile)
-    while len(tiles) % columns:
-        tiles.append(np.zeros_like(tiles[0]))
+    tiles += [np.zeros_like(tiles[0])] * (-len(tiles) % columns)
     rows = [np.hstack(tiles[at : at + columns]) for at in range(0, len(tiles), columns)]
     return np.vstack(rows)
 
