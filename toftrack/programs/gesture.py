@@ -7,6 +7,7 @@ known and those in the file; `remove` takes a gesture out of it.
 
 from __future__ import annotations
 
+import argparse
 import sys
 from collections.abc import Sequence
 from contextlib import closing
@@ -54,11 +55,7 @@ def main(arguments: Sequence[str]) -> None:
     elif options.command == "remove" and len(words) == 1:
         _remove(path, poses, words[0])
     elif options.command == "add" and len(words) >= 2:
-        if options.begin is None or options.end is None:
-            raise ToftrackError("say which part of the recording shows it: --from 2.0 --to 3.0")
-        name, recording, *overrides = words
-        part_s = options.begin, options.end
-        _add(path, poses, name, recording, part_s, options.replace, overrides)
+        _add(path, poses, options)
     else:
         raise ToftrackError(
             f"'{' '.join((options.command, *words))}' has too few or too many words; give"
@@ -66,21 +63,16 @@ def main(arguments: Sequence[str]) -> None:
         )
 
 
-def _add(
-    path: Path,
-    poses: Sequence[NamedPose],
-    name: str,
-    recording: str,
-    part_s: tuple[float, float],
-    replace: bool,
-    overrides: Sequence[str],
-) -> None:
-    """Learn a gesture from a part of a recording, from and to in seconds from its first frame, and
-    write it into the file, beside the poses that are in it.
+def _add(path: Path, poses: Sequence[NamedPose], options: argparse.Namespace) -> None:
+    """Learn a gesture from a part of a recording and write it into the file, beside the poses that
+    are in it.
 
     Raises ToftrackError when the recording cannot be read, the name is taken, the hand was not
     followed or moved in that part, or the gesture looks like another.
     """
+    if options.begin is None or options.end is None:
+        raise ToftrackError("say which part of the recording shows it: --from 2.0 --to 3.0")
+    name, recording, *overrides = options.words
     with one_sentence():
         config = configuration(*overrides)
         gestures: Gestures | None = instantiate(config.gestures)
@@ -88,10 +80,10 @@ def _add(
         raise ToftrackError("gestures=none knows no gesture; leave it out")
     known: str = config.gestures.known
     names = [*(pose.name for pose in poses), *(d.name for d in SETS[known])]
-    _check_name(name, names, replace)
+    _check_name(name, names, options.replace)
     with_it = [pose for pose in poses if pose.name != name]
     with closing(open_source(recording)) as frames:
-        angles, believed = _track(frames, recording, part_s, overrides)
+        angles, believed = _track(frames, recording, options.begin, options.end, overrides)
     pose = learned_pose(name, angles, believed, FLEXION_RAD)
     with_it.append(pose)
     gestures_with(known, with_it, gestures.settings, str(path))
@@ -101,10 +93,11 @@ def _add(
 
 
 def _track(
-    frames: FrameStore, recording: str, part_s: tuple[float, float], overrides: Sequence[str]
+    frames: FrameStore, recording: str, begin_s: float, end_s: float, overrides: Sequence[str]
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Joint angles, (T, 21) rad, and which frames are believed, (T,), of a part of a recording."""
-    begin_s, end_s = part_s
+    """Joint angles, (T, 21) rad, and which frames are believed, (T,), of a part of a recording, in
+    seconds from its first frame.
+    """
     times = np.asarray(frames.timestamp_s) - frames.timestamp_s[0]
     rows = np.flatnonzero((times >= begin_s) & (times <= end_s))
     if not 0 <= begin_s < end_s <= times[-1] + 1 / frames.fps or not len(rows):
