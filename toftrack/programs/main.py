@@ -48,16 +48,8 @@ _TRACK = f"""toftrack track follows a hand and writes joints, state and gesture 
 {_EXAMPLES}
 FILE is .npz, .srs, a folder of 16-bit PNG images, a ROS bag, an Azure Kinect's .mkv, or another
 kind in docs/formats.md. The results go into outputs/DATE/TIME/, or where hydra.run.dir=DIR says;
-Ctrl-C ends a run and keeps what was done. All other words are settings: KEY=VALUE, or
-GROUP=CHOICE from
-
-{{groups}}
-
-  toftrack track --cfg job                    all settings, composed
-  toftrack track -m seed=1,2,3 view=none      a sweep: one run after another
-  toftrack track --hydra-help                 further options
-
-The files in {{folder}} list all settings and say what each does."""
+Ctrl-C ends a run and keeps what was done.
+"""
 
 _TRAIN = """toftrack train learns the space of hand poses that the tracker searches.
 
@@ -66,13 +58,16 @@ _TRAIN = """toftrack train learns the space of hand poses that the tracker searc
   toftrack train data=run data.path=RUN       from the poses of a run, outputs/DATE/TIME
 
 The model goes into the folder that is named at the end, or where hydra.run.dir=DIR says; use it
-with toftrack track pose_space=KIND pose_space.file=FILE. All other words are settings: KEY=VALUE,
-or GROUP=CHOICE from
+with toftrack track pose_space=KIND pose_space.file=FILE.
+"""
+
+_SETTINGS = """All other words are settings: KEY=VALUE, or GROUP=CHOICE from
 
 {groups}
 
-  toftrack train --cfg job                    all settings, composed
-  toftrack train --hydra-help                 further options
+  toftrack {name} --cfg job                    all settings, composed
+  toftrack {name} -m KEY=A,B,C                 a sweep: one run after another
+  toftrack {name} --hydra-help                 further options
 
 The files in {folder} list all settings and say what each does."""
 
@@ -122,7 +117,8 @@ def long_help(name: str) -> str:
         choices = sorted(path.stem for path in group.glob("*.yaml"))
         if group.name in _GROUPS_OF_TRAINING if name == "train" else group.name not in others:
             groups.append(f"  {group.name:<14}{', '.join(choices)}")
-    return _LONG_HELP[name].format(groups="\n".join(groups), folder=folder)
+    settings = _SETTINGS.format(name=name, groups="\n".join(groups), folder=folder)
+    return f"{_LONG_HELP[name]}\n{settings}"
 
 
 def _program(name: str) -> Callable[[Sequence[str]], object]:
