@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 from helpers.tracking import ROOT, configuration
+from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import toftrack
 from toftrack.errors import ToftrackError
 from toftrack.programs import main as front
-from toftrack.programs.applications import options_first, quoted, with_recording
+from toftrack.programs.applications import options_last, quoted, with_recording
 
 ODD = ("two words.npz", "[1] (2) {3}.npz", "a=b.npz", "Übung ß.npz", "it's.npz", 'a "b".npz')
 ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
@@ -135,17 +136,17 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
 
 @pytest.mark.parametrize("words", ["a.npz -m seed=1,2 view=none", "-m seed=1,2 view=none a.npz"])
 def test_a_sweep_of_a_recording_may_be_written_in_any_order(words: str) -> None:
-    option, *overrides = options_first(with_recording(words.split()))
+    *overrides, option = options_last(with_recording(words.split()))
     assert option == "-m"
     assert set(overrides) == {"device=replay", "device.path='a.npz'", "seed=1,2", "view=none"}
 
 
-@pytest.mark.parametrize(("given", "info"), [("--info", "all"), ("-i defaults", "defaults")])
-def test_options_keep_their_values(given: str, info: str) -> None:
-    words = ["seed=1", "--config-dir", "my", *given.split(), "view=none", "--cfg", "job"]
-    assert options_first(with_recording(words)) == [
-        *("--config-dir", "my", f"--info={info}", "--cfg", "job", "seed=1", "view=none")
-    ]
+@pytest.mark.parametrize("info", ["--info", "-i defaults"])
+def test_options_keep_their_values(info: str) -> None:
+    words = ["--config-dir", "my", *info.split(), "view=none", "--cfg", "job"]
+    read = get_args_parser().parse_args(options_last(with_recording(["seed=1", *words])))
+    assert (read.config_dir, read.cfg, read.overrides) == ("my", "job", ["seed=1", "view=none"])
+    assert read.info == (info.partition(" ")[2] or "all")
 
 
 @pytest.mark.parametrize(
@@ -185,7 +186,7 @@ def test_an_option_that_there_is_not_is_one_sentence(words: str, capsys) -> None
     "name", ["手 يد/it", r"C:\new\run", r"C:\Users\MAXMUS~1\run", r"\\machine\runs", "C:\\runs\\"]
 )
 def test_a_folder_s_name_may_be_of_any_script_and_of_windows(name: str) -> None:
-    (override,) = options_first([f"hydra.run.dir={name}"])
+    (override,) = options_last([f"hydra.run.dir={name}"])
     read = OverridesParser.create().parse_override(override)
     assert (read.key_or_group, read.value()) == ("hydra.run.dir", name)
 

@@ -79,7 +79,7 @@ def start(
     job: Callable[[DictConfig], float], program: str, config: str, arguments: Sequence[str]
 ) -> None:
     """Run a Hydra application; it reads the command line of the process."""
-    folder, words = str(configuration_folder()), options_first(arguments)
+    folder, words = str(configuration_folder()), options_last(arguments)
     for own in config_folders(arguments):
         searched(own)
     offer_installed()
@@ -104,8 +104,9 @@ def _line_to_complete(line: str) -> str:
     being typed. A recording's name, or most options, would be an error.
     """
     *words, last = line.split(" ")
-    settings = (word for word in words if "=" in word and word[0] != "-" or word == "-m")
-    return " ".join(["toftrack", *options_first([*settings]), last if last[:1] != "-" else ""])
+    sweep = ["-m"] if "-m" in words else []
+    settings = (_readable(word) for word in words if "=" in word and word[0] != "-")
+    return " ".join(["toftrack", *sweep, *settings, last if last[:1] != "-" else ""])
 
 
 def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> list[str]:
@@ -133,7 +134,7 @@ def with_recording(arguments: Sequence[str], folders: Sequence[str] = ()) -> lis
                 f"'{word}' is no recording; settings are given without blanks as {key}=VALUE"
             )
     if len(files) > 1:
-        options_first(others)  # an option that there is not tells more than the word after it
+        options_last(others)  # an option that there is not tells more than the word after it
         raise ToftrackError(
             f"there are two recordings, '{files[0]}' and '{files[1]}'; give one at a time, or quote"
             " a name that has blanks in it"
@@ -168,8 +169,10 @@ def config_folders(arguments: Sequence[str]) -> list[str]:
     return found
 
 
-def options_first(arguments: Sequence[str]) -> list[str]:
-    """The arguments in the order that Hydra's parser wants: options, and then all overrides."""
+def options_last(arguments: Sequence[str]) -> list[str]:
+    """The arguments in an order that Hydra's parser reads: all overrides, and then options. After
+    --info, whose value may be left out, it would take an override for that.
+    """
     options: list[str] = []
     overrides: list[str] = []
     for word, is_value in _words(arguments):
@@ -180,25 +183,19 @@ def options_first(arguments: Sequence[str]) -> list[str]:
             options.append(word)
         else:
             overrides.append(_readable(word))
-    return [*options, *overrides]
+    return [*overrides, *options]
 
 
 def _words(arguments: Sequence[str]) -> Iterator[tuple[str, bool]]:
-    """The arguments, each with whether it is the value of an option; --info and its value are one
-    word: left out, the next one would be it.
-    """
-    words: list[str] = []
+    """The arguments, each with whether it is the value of an option."""
+    before, is_value = "", False
     for word in arguments:
-        if words and words[-1] == "--info=all" and word in _INFO:
-            words[-1] = f"--info={word}"
-        else:
-            words.append("--info=all" if word in ("--info", "-i") else word)
-    is_value = False
-    for word in words:
+        told = before in _WITH_VALUE or before in ("--info", "-i") and word in _INFO
+        is_value = told and not is_value
         yield word, is_value
-        is_value = not is_value and word in _WITH_VALUE
-    if is_value:
-        raise ToftrackError(f"{words[-1]} has no value; --hydra-help tells which there are")
+        before = word
+    if before in _WITH_VALUE and not is_value:
+        raise ToftrackError(f"{before} has no value; --hydra-help tells which there are")
 
 
 def _check_option(word: str) -> None:
