@@ -29,9 +29,6 @@ from toftrack.views.figures.poses import (
     traversals_figure,
 )
 
-_SILENT_S = 1.0
-"""What is done sooner needs no progress shown."""
-
 
 def train(config: DictConfig) -> float:
     """Learn the configured space; returns what a sweep minimises: the root mean square error in
@@ -113,7 +110,7 @@ def _table(kind: str, dims: list[int], data: PoseData, settings: dict[str, Any])
         file=sys.stderr,
         disable=None,
         unit=" spaces",
-        delay=_SILENT_S,
+        delay=1.0,  # what is done sooner needs no progress shown
         leave=not in_sweep(),
     ) as bar:
         return [evaluate_space(kind, number, data, settings, bar.update) for number in dims]
