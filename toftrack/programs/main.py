@@ -72,7 +72,6 @@ _SETTINGS = """All other words are settings: KEY=VALUE, or GROUP=CHOICE from
 The files in {folder} list all settings and say what each does."""
 
 _LONG_HELP = {"track": _TRACK, "train": _TRAIN}
-_GROUPS_OF_TRAINING = ("data", "pose_space")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -111,12 +110,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def long_help(name: str) -> str:
     """What `toftrack track --help` prints."""
     folder = configuration_folder()
+    names = {"data", "pose_space"}
+    if name == "track":
+        names = {path.parent.name for path in folder.glob("*/*.yaml")} - {"data"}
     groups = []
-    others = ("data", "hydra")
-    for group in sorted(path for path in folder.iterdir() if path.is_dir()):
-        choices = sorted(path.stem for path in group.glob("*.yaml"))
-        if group.name in _GROUPS_OF_TRAINING if name == "train" else group.name not in others:
-            groups.append(f"  {group.name:<14}{', '.join(choices)}")
+    for group in sorted(names):
+        choices = sorted(path.stem for path in (folder / group).glob("*.yaml"))
+        groups.append(f"  {group:<14}{', '.join(choices)}")
     settings = _SETTINGS.format(name=name, groups="\n".join(groups), folder=folder)
     return f"{_LONG_HELP[name]}\n{settings}"
 
