@@ -174,7 +174,7 @@ def test_an_ablation_has_the_differences_of_each_variant(folder, tmp_path, capsy
     assert result["variants"]["default"]["differences"]["usable_pct"]["mean"] == 0
     text = (tmp_path / "a.md").read_text()
     assert "    toftrack benchmark ablation" in text and "| no refinement |" in text
-    with pytest.raises(ToftrackError, match="there is no variant 'no-luck'"):
+    with pytest.raises(ToftrackError, match="--variants=no-luck is unknown"):
         benchmark.main(["ablation", str(folder), "--variants", "no-luck"])
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from toftrack.configuration.compose import searched
-from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, check_choice, reported_errors
 from toftrack.programs.command_line import Parser, plain_parser, typed
 
 
@@ -114,9 +114,7 @@ def _ablation(arguments: Sequence[str]) -> None:
     def variants(text: str) -> list[str]:
         names = text.split(",")
         for name in names:
-            if name not in known:
-                some = ", ".join(known)
-                raise ToftrackError(f"there is no variant '{name}'; give some of {some}")
+            check_choice("--variants", name, known)
         return names
 
     parser = _parser_of_recordings("ablation", accuracy.ABLATION)

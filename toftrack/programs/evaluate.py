@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from toftrack.configuration.compose import searched
-from toftrack.errors import ToftrackError
+from toftrack.errors import check_choice
 from toftrack.evaluation.datasets import DATA_SETS, LabelledSequence, open_data_set
 from toftrack.evaluation.public import evaluate, table, totals
 from toftrack.evaluation.results import checked_targets, write_text
@@ -56,10 +56,8 @@ def main(arguments: Sequence[str]) -> None:
 
 
 def _chosen(sequences: list[LabelledSequence], names: str | None) -> list[LabelledSequence]:
-    if names is None:
-        return sequences
     known = {sequence.name: sequence for sequence in sequences}
-    for name in names.split(","):
-        if name not in known:
-            raise ToftrackError(f"there is no sequence '{name}'; there are {', '.join(known)}")
-    return [known[name] for name in names.split(",")]
+    chosen = known if names is None else names.split(",")
+    for name in chosen:
+        check_choice("--sequences", name, known)
+    return [known[name] for name in chosen]

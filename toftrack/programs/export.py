@@ -27,21 +27,19 @@ from toftrack.output.lines import DROPPED
 from toftrack.output.run_folder import read_run
 from toftrack.programs.command_line import note, plain_parser
 
-FORMATS = ("glb", "bvh", "csv")
-
 
 def main(arguments: Sequence[str]) -> None:
     """Parse the command line, write the file, print its name. Raises ToftrackError."""
     parser = plain_parser("toftrack export", __doc__)
     parser.add_argument("run", metavar="RUN", help="the output folder of toftrack track")
-    parser.add_argument("--to", required=True, choices=FORMATS, help="the format")
+    parser.add_argument("--to", required=True, choices=("glb", "bvh", "csv"), help="the format")
     options = parser.parse_args(arguments)
     for path in export(Path(options.run).expanduser(), options.to):
         print(f"  {path}")
 
 
 def export(folder: Path, kind: str) -> list[Path]:
-    """Write a run's folder in a format of FORMATS; returns the files that were written.
+    """Write a run's folder in a format, glb, bvh or csv; returns the files that were written.
 
     Raises ToftrackError: the folder is no run's, or has no hand; or the file cannot be written.
     """
