@@ -77,15 +77,11 @@ class Group:
 def read_runs(folder: str | Path) -> list[Run]:
     """Every job below a folder, in the order of their numbers; ToftrackError when there is none."""
     folder = Path(folder)
-    if not folder.is_dir():
-        raise ToftrackError(
-            f"there is no folder '{folder}'; give the folder of a sweep, multirun/DATE/TIME"
-        )
     found = [path.parents[1] for path in folder.rglob(".hydra/overrides.yaml")]
     if not found:
         raise ToftrackError(
-            f"no job below {folder} (no .hydra/overrides.yaml); give the folder of a sweep,"
-            " multirun/DATE/TIME"
+            f"there is no folder '{folder}' with jobs (.hydra/overrides.yaml) below; give that of a"
+            " sweep, multirun/DATE/TIME"
         )
 
     def natural(path: Path) -> list[tuple[int, str]]:
