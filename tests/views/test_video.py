@@ -14,7 +14,6 @@ from helpers.tracking import ROOT
 from helpers.videos import video_frames
 
 from toftrack.errors import ToftrackError
-from toftrack.views.overlay import VideoView
 from toftrack.views.video import VideoFile, cut_to_whole
 
 KILLED = """
@@ -80,12 +79,6 @@ def test_a_browser_plays_what_is_finished_and_what_was_killed(
     chromium.get(page.as_uri())
     for path, frames in ((finished, 12), (killed, 30)):
         assert chromium.execute_async_script(PLAY, path.as_uri()) == ["ended", frames]
-
-
-def test_a_missing_encoder_is_reported_before_the_first_frame(tmp_path, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(ToftrackError, match="needs the package av.*view=none"):
-        VideoView(tmp_path, 25.0)
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")

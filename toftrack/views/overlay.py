@@ -27,7 +27,7 @@ from toftrack.render.model_image import model_range_image
 from toftrack.views.base import TrackedFrame, View
 from toftrack.views.pictures import write_picture
 from toftrack.views.skeleton import SLOT_RGB, draw_hands, side_words
-from toftrack.views.video import VideoFile, video_library, writing
+from toftrack.views.video import VideoFile, writing
 
 _RED = (40, 40, 220)
 _WHITE = (255, 255, 255)
@@ -138,13 +138,12 @@ def draw_estimates(
 class VideoView(View):
     """Keeps panels as a video, overlay.mp4, and as a filmstrip of ten of them, overlay.png.
 
-    Raises ToftrackError where nothing encodes; by `add` and `close`, when a file cannot be written.
+    Raises ToftrackError, by `add` and `close`, when a file cannot be written.
     """
 
     def __init__(self, folder: str | Path, fps: float, frames: int | None = None) -> None:
         self.video_path = Path(folder) / VIDEO
         self.strip_path = Path(folder) / STRIP
-        video_library()  # better missed now than at the first frame
         self._fps = fps
         self._video: VideoFile | None = None
         self._size = (0, 0)

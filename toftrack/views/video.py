@@ -30,11 +30,12 @@ class VideoFile:
 
     fps: from 1 to 120, 25 where it is not finite.  size: width and height, px, both even.
 
-    Raises ToftrackError where there is no encoder, or (by all methods) the file cannot be written.
+    Raises ToftrackError, as do all methods, where the file cannot be written.
     """
 
     def __init__(self, path: Path, fps: float, size: tuple[int, int]) -> None:
-        av = video_library()
+        import av  # takes a while
+
         self._path, self._new_frame = path, av.VideoFrame.from_ndarray
         # Two decimals, so that the clock's steps are whole numbers of modest size.
         rate = min(max(round(float(fps), 2), 1.0), 120.0) if math.isfinite(fps) else 25.0
@@ -118,14 +119,3 @@ def writing(path: Path, *kinds: type[Exception]) -> AbstractContextManager[None]
     """Errors of these kinds, by default the system's, become a sentence on a file of a view."""
     remedy = "check the folder and the free space, or choose view=none"
     return reported_errors(f"'{path}' cannot be written", remedy, *kinds)
-
-
-def video_library() -> Any:
-    """The package that encodes; ToftrackError where it is not installed."""
-    with reported_errors(
-        "view=video needs the package av",
-        "pip install av, or choose view=none",
-        ImportError,
-    ):
-        import av
-    return av
