@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import sys
 import threading
@@ -118,11 +117,11 @@ def test_ctrl_c_while_watched_keeps_the_results(tmp_path: Path, monkeypatch) -> 
 def test_the_page_stays_after_the_last_frame_until_ctrl_c(monkeypatch, capsys) -> None:
     stayed: list[float] = []
 
-    def interrupted(seconds: float) -> None:
+    def interrupted(event: threading.Event, seconds: float) -> None:
         stayed.append(seconds)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(browser, "_stay", interrupted)
+    monkeypatch.setattr(browser, "wait", interrupted)
     for linger_s, words in ((5.0, "for 5 s (Ctrl-C ends it)"), (float("inf"), "until Ctrl-C")):
         with made(linger_s=linger_s):
             pass  # ends without an error: everything was done
@@ -144,7 +143,7 @@ def test_ctrl_c_ends_a_wait_also_where_the_system_s_own_go_on(monkeypatch) -> No
     with monkeypatch.context() as patch:
         patch.setattr(threading.Event, "wait", deaf)
         with pytest.raises(KeyboardInterrupt):
-            browser._stay(math.inf)
+            browser.wait(threading.Event())
     assert all(seconds is not None and seconds < 1 for seconds in waits)
 
 

@@ -171,7 +171,7 @@ class BrowserView(View):
         how_long = "until Ctrl-C" if for_ever else f"for {self._linger_s:g} s (Ctrl-C ends it)"
         print(f"that was the last frame; the page stays {how_long}", file=sys.stderr, flush=True)
         try:
-            _stay(self._linger_s)
+            wait(threading.Event(), self._linger_s)
         except KeyboardInterrupt:
             pass  # everything was done by then
 
@@ -244,10 +244,6 @@ class _Visitor(Client):
             self.tell({"refused": "commands need the whole address that the tracker printed"})
         else:
             self._view.asked.append(command)
-
-
-def _stay(seconds: float) -> None:
-    wait(threading.Event(), seconds)
 
 
 def _encode(tracked: TrackedFrame, quality: int) -> bytes:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.pose_space.base import PoseSpace
-from toftrack.pose_space.data.pose_data import GESTURES, basic_pose
+from toftrack.pose_space.data.pose_data import basic_pose
 from toftrack.render.model_image import model_range_image
 from toftrack.views.figures import chart
 from toftrack.views.overlay import range_grey
@@ -78,20 +78,16 @@ def manifold_figure(space: PoseSpace) -> np.ndarray:
 
 
 def scatter_gestures(axes: Axes, space: PoseSpace, points: np.ndarray) -> None:
-    """The training poses at (N, 2) points of a plot, coloured by the nearest gesture."""
-    nearest = np.array(nearest_gestures(space.decode(space.training_latents)), object)
-    for gesture, colour in ((None, chart.GREY), *COLOURS.items()):
-        name = "other training poses" if gesture is None else WORDS.get(gesture, gesture)
-        axes.scatter(*points[nearest == gesture].T, 36, color=colour, alpha=0.6, label=name)
-
-
-def nearest_gestures(angles: Tensor) -> list[str | None]:
-    """The gesture nearest to each pose, (N, 21) rad; None where all are far."""
-    basic = torch.stack([basic_pose(gesture) for gesture in GESTURES]).to(angles)
-    distance = (angles[:, None] - basic).square().mean(-1).sqrt()
-    least, which = distance.min(1)
-    near = torch.rad2deg(least) < _NEAR_DEGREES
-    return [GESTURES[w] if n else None for w, n in zip(which.tolist(), near.tolist(), strict=True)]
+    """The training poses at (N, 2) points of a plot, coloured by the nearest gesture, grey where
+    all are far.
+    """
+    angles = space.decode(space.training_latents)
+    basic = torch.stack([basic_pose(gesture) for gesture in COLOURS]).to(angles)
+    least, which = (angles[:, None] - basic).square().mean(-1).sqrt().min(1)
+    nearest = torch.where(torch.rad2deg(least) < _NEAR_DEGREES, which, -1).cpu().numpy()
+    named = [(WORDS.get(gesture, gesture), colour) for gesture, colour in COLOURS.items()]
+    for number, (name, colour) in enumerate([("other training poses", chart.GREY), *named], -1):
+        axes.scatter(*points[nearest == number].T, 36, color=colour, alpha=0.6, label=name)
 
 
 def traversals_figure(space: PoseSpace, steps: int = 7, size: int = 150) -> np.ndarray:
