@@ -10,7 +10,7 @@ import datetime
 import json
 import os
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -87,18 +87,14 @@ class ResultWriter:
         }
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._lines = LineFile(self.folder)
+            with ExitStack() as unless_done:
+                self._lines = unless_done.enter_context(closing(LineFile(self.folder)))
+                make_way(self.folder)
+                self._lines.clear()
+                _write_json(self.folder / "run.json", self._facts)
+                unless_done.pop_all()
         except OSError as error:
-            raise _unwritable(self.folder, error) from error
-        try:
-            make_way(self.folder)
-            self._lines.clear()
-            _write_json(self.folder / "run.json", self._facts)
-        except BaseException as error:
-            self._lines.close()
-            if isinstance(error, OSError):
-                raise _unwritable(self.folder, error) from error
-            raise
+            raise self._unwritable(error) from error
         self._records: Records | None = None
         self._closed = False
 
@@ -111,7 +107,7 @@ class ResultWriter:
                 self._records = Records(self.folder, estimates[0].latent.size, len(estimates))
             self._records.append(estimates)
         except OSError as error:
-            raise _unwritable(self.folder, error, self.frames) from error
+            raise self._unwritable(error) from error
 
     def close(self) -> None:
         """Write track.npz and summary.json, or ToftrackError; a second call does nothing."""
@@ -126,9 +122,28 @@ class ResultWriter:
                     *(self.complete, realtime, self.apparent_m),
                 )
         except OSError as error:
-            raise _unwritable(self.folder, error, self.frames) from error
+            raise self._unwritable(error) from error
         finally:
             self._lines.close()
+
+    def _unwritable(self, error: OSError) -> ToftrackError:
+        reason, folder = error.strerror or error, self.folder
+        if not self.frames:
+            return ToftrackError(
+                f"the output folder '{folder}' cannot be written ({reason}); choose another with "
+                "hydra.run.dir=DIR"
+            )
+        if not folder.exists():
+            return UnwritableError(
+                f"the output folder '{folder}' was removed or renamed while the run went on; where "
+                f"it is now, `toftrack recover` makes the files of the {self.frames} frames until "
+                "then"
+            )
+        return UnwritableError(
+            f"the output folder '{folder}' cannot be written any more ({reason}); the "
+            f"{self.frames} frames until then are in its {LINES}: make room, or make it writable, "
+            f"then `toftrack recover {folder}`"
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -198,19 +213,18 @@ def _every_frame(records: Records) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """
     names = ("index", "timestamp_s", "compute_s")
     index, times, seconds = (records.column(name) for name in names)
-    counts_on = bool(len(index)) and bool((np.diff(index) >= 1).all())
-    if not counts_on or int(index[-1]) - int(index[0]) > _MOST_HELD:
-        # Where the device counts anew there is nothing to fill in.
-        changed = dict(zip(names, (index, times, seconds), strict=True))
-        return np.arange(len(index)), changed | {DROPPED: np.zeros(len(index), bool)}
-    every = np.arange(index[0], index[-1] + 1)
-    rows = np.searchsorted(index, every, side="right") - 1
+    # Where the device counts anew there is nothing to fill in.
+    every, rows = index, np.arange(len(index))
+    counts_on = len(index) > 0 and (np.diff(index) >= 1).all()
+    if counts_on and int(index[-1]) - int(index[0]) <= _MOST_HELD:
+        every = np.arange(index[0], index[-1] + 1)
+        rows = np.searchsorted(index, every, side="right") - 1
+        times = np.interp(every, index, times)
     dropped = index[rows] != every
-    seconds = np.where(dropped, np.float32(0), seconds[rows])
     changed = {
         "index": every,
-        "timestamp_s": np.interp(every, index, times),
-        "compute_s": seconds,
+        "timestamp_s": times,
+        "compute_s": np.where(dropped, np.float32(0), seconds[rows]),
         DROPPED: dropped,
     }
     if dropped.any():
@@ -237,10 +251,7 @@ def read_results(path: str | Path) -> dict[str, Any]:
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
-        about = content["metadata"]
-        parts = [about, *(about.get(name) for name in ("device", "config", "camera"))]
-        parts.append((about.get("config") or {}).get("device"))
-        if not all(isinstance(part, dict | None) for part in parts):
+        if not _are_metadata(content["metadata"]):
             raise ValueError("the metadata are no objects")
         content |= facts_for_readers(content["metadata"])
         _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
@@ -302,7 +313,9 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
         ) from None
     except (OSError, ValueError) as error:
         raise ToftrackError(f"'{path}' cannot be read ({error}); track again") from None
-    if not isinstance(facts, dict) or facts.get("format") != RUN_FORMAT or not _is_whole(facts):
+    known = isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
+    whole = known and isinstance(facts.get("joint_names"), list)
+    if not whole or not _are_metadata(facts.get("metadata")):
         raise ToftrackError(f"'{path}' does not describe a run; give another folder")
     if facts.get("version") != _VERSION:
         raise ToftrackError(
@@ -312,35 +325,17 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
     return facts
 
 
-def _is_whole(facts: dict[str, Any]) -> bool:
-    """Whether what a run.json tells of a run is of the kinds that it should be."""
-    metadata, names = facts.get("metadata"), facts.get("joint_names")
-    if not isinstance(metadata, dict) or not isinstance(names, list):
+def _are_metadata(metadata: Any) -> bool:
+    """Whether what is told of a run is of the kinds that it should be."""
+    if not isinstance(metadata, dict):
         return False
-    return all(isinstance(metadata.get(name) or {}, dict) for name in _PARTS)
+    parts = {name: metadata.get(name) or {} for name in _PARTS}
+    whole = all(isinstance(part, dict) for part in parts.values())
+    return whole and isinstance(parts["config"].get("device") or {}, dict)
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
     write_whole(path, json.dumps(strict(content), indent=1, allow_nan=False) + "\n")
-
-
-def _unwritable(folder: Path, error: OSError, frames: int | None = None) -> ToftrackError:
-    reason = error.strerror or error
-    if frames and not folder.exists():
-        return UnwritableError(
-            f"the output folder '{folder}' was removed or renamed while the run went on; where it "
-            f"is now, `toftrack recover` makes the files of the {frames} frames until then"
-        )
-    if frames:
-        return UnwritableError(
-            f"the output folder '{folder}' cannot be written any more ({reason}); the {frames} "
-            f"frames until then are in its {LINES}: make room, or make it writable, then `toftrack "
-            f"recover {folder}`"
-        )
-    return ToftrackError(
-        f"the output folder '{folder}' cannot be written ({reason}); choose another with "
-        "hydra.run.dir=DIR"
-    )
 
 
 _MANY = 0.05

@@ -74,9 +74,9 @@ class Run:
     @property
     def camera(self) -> Camera:
         """The camera of the run, whose undistorted image the joints belong to."""
-        about = self.results["metadata"].get("camera")
+        about = self.results["metadata"].get("camera") or {}
         known = {one.name for one in fields(Camera)}
-        if not isinstance(about, dict) or not {"K", "width", "height"} <= about.keys():
+        if not {"K", "width", "height"} <= about.keys():
             raise ToftrackError(f"the run in '{self.folder}' does not say which camera it had")
         return Camera(**{name: value for name, value in about.items() if name in known})
 
@@ -101,8 +101,7 @@ class Run:
     @property
     def config(self) -> dict[str, Any]:
         """The run's configuration."""
-        config = self.results["metadata"].get("config")
-        return config if isinstance(config, dict) else {}
+        return self.results["metadata"].get("config") or {}
 
     @property
     def shape(self) -> HandShape:
@@ -137,8 +136,8 @@ class Run:
 
     def pose_space(self) -> PoseSpace:
         """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
-        settings = dict(self._settings("pose_space"))
-        target, kind = settings.pop("_target_", None), str(settings.get("kind"))
+        target, settings = self._settings("pose_space")
+        kind = str(settings.get("kind"))
         if target != f"{make_pose_space.__module__}.{make_pose_space.__name__}" or "." in kind:
             raise self._of_its_own("pose space", kind if "." in kind else target)
         if settings.get("file"):
@@ -157,14 +156,15 @@ class Run:
         folder = read_run_facts(self.folder).get("working_folder")
         return None if folder is None else str(folder)
 
-    def _settings(self, group: str) -> dict[str, Any]:
+    def _settings(self, group: str) -> tuple[object, dict[str, Any]]:
+        """What a group's settings are for, and these."""
         settings = self.config.get(group)
         if not isinstance(settings, dict):
             raise ToftrackError(
                 f"'{self.folder / 'track.npz'}' does not say which {group} made it; run "
                 "track.py again with this version"
             )
-        return settings
+        return settings.get("_target_"), {k: v for k, v in settings.items() if k != "_target_"}
 
     def _of_its_own(self, what: str, target: object) -> ToftrackError:
         return ToftrackError(
@@ -174,8 +174,7 @@ class Run:
 
     def _made(self, kind: type, group: str) -> Any:
         """Only kinds that are known here: a file must not say what is to be executed."""
-        settings = dict(self._settings(group))
-        target = settings.pop("_target_", None)
+        target, settings = self._settings(group)
         if target != f"{kind.__module__}.{kind.__qualname__}":
             raise self._of_its_own(group, target)
         # JSON has no word for infinity: a number that is null was one.
@@ -226,12 +225,8 @@ def read_run(folder: str | Path) -> Run:
             f"there is no folder '{folder}'; give the output folder of toftrack track"
         )
     missing = [name for name in FILES if not (folder / name).is_file()]
-    if len(missing) == len(FILES):
-        raise ToftrackError(
-            f"'{folder}' is not the output folder of a run: it has no {FILES[0]}; give a folder "
-            "that track.py wrote, such as outputs/DATE/TIME"
-        )
     if missing:
+        read_run_facts(folder)  # which says where it is no run's at all
         raise ToftrackError(
             f"'{folder}' lacks {' and '.join(missing)}, so the run did not finish or the file was "
             f"moved; try `toftrack recover {folder}`"

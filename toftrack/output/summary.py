@@ -125,7 +125,10 @@ def run_metrics(
     numbers = index[known]
     found = truth.of_frames(index[known])
     done = {field.name: records.column(field.name, rows[known]) for field in fields(Estimates)}
-    estimates = Estimates(**found_side(done))
+    sure = done["side_probability"]
+    if (sure[np.isfinite(sure)] == 1).all():  # a side that was given is no finding
+        done = {name: array for name, array in done.items() if not name.startswith("side")}
+    estimates = Estimates(**done)
     both = measured(estimates, found)
     if both.slots is None:
         return _metrics(both.first, estimates, found, numbers)
@@ -137,14 +140,6 @@ def run_metrics(
         return metrics
     second = _metrics(both.second, estimates.slot(both.slots[1]), found.other, numbers)
     return metrics | {"second": {"slot": both.slots[1]} | second}
-
-
-def found_side(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The arrays of a track without its side where that was given: it is no finding then."""
-    probability = arrays.get("side_probability", np.ones(0))
-    if not (probability[np.isfinite(probability)] == 1).all():
-        return arrays
-    return {name: array for name, array in arrays.items() if not name.startswith("side")}
 
 
 def _metrics(
