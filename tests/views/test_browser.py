@@ -55,13 +55,13 @@ def test_the_picture_is_the_overlay_of_the_newest_frame(view, visitor) -> None:
     assert picture.shape == panel.shape
     assert np.abs(picture.astype(int) - panel).mean() < 3
     assert np.abs(picture.astype(int) - draw_tracked(first)[CAPTION_PX:]).mean() > 3
-    estimate = second.estimates[0]
+    estimate, (hand,) = second.estimates[0], facts["hands"]
     assert (facts["phase"], facts["index"]) == ("live", estimate.index)
     assert (facts["state"], facts["lost"]) == (state_words(estimate), estimate.lost)
     for name in ("score", "confidence", "pinch"):
-        assert facts[name] == pytest.approx(getattr(estimate, name), abs=1e-3)
-    assert facts["gesture"] == estimate.gesture and facts["side"] == "right"
-    assert (facts["doubted"], facts["dropped"]) == (["wrist", "thumb_cmc"], 5)
+        assert hand[name] == pytest.approx(getattr(estimate, name), abs=1e-3)
+    assert hand["gesture"] == estimate.gesture and hand["side"] == "right"
+    assert (hand["doubted"], facts["dropped"]) == (["wrist", "thumb_cmc"], 5)
 
 
 MEMORY = np.full((144, 176), 1000, np.uint16)

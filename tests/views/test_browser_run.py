@@ -149,7 +149,8 @@ def test_ctrl_c_ends_a_wait_also_where_the_system_s_own_go_on(monkeypatch) -> No
 
 def test_the_page_works_in_a_browser(chromium, view) -> None:
     def text(name: str) -> str:
-        return chromium.execute_script(f"return document.getElementById('{name}').textContent")
+        found = f"document.querySelector('#{name}, #newest .{name}')"
+        return chromium.execute_script(f"return {found}.textContent")
 
     def picture(name: str) -> str:
         return chromium.execute_script(f"return document.getElementById('{name}').toDataURL()")

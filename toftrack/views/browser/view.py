@@ -257,22 +257,18 @@ def _encode(tracked: TrackedFrame, quality: int) -> bytes:
 
 
 def _facts(tracked: TrackedFrame) -> dict[str, Any]:
-    """What the page writes beside the picture, JSON-able: of the frame and of a hand, or `hands`.
+    """What the page writes beside the picture, JSON-able: of the frame and of each slot's hand.
 
-    Of several hands the frame is lost when none can be used, and its state is the first slot's.
+    The frame is lost when no hand can be used, and its state is the first slot's.
     """
-    first = tracked.hands[0]
-    of_frame = {
-        "index": int(first.estimate.index),
-        "ms": strict(1e3 * first.estimate.compute_s),
+    first = tracked.estimates[0]
+    return {
+        "index": int(first.index),
+        "ms": strict(1e3 * first.compute_s),
         "dropped": tracked.dropped,
         "advice": list(tracked.advice),
-    }
-    if len(tracked.hands) == 1:
-        side = {"side": first.shape.side, "told": tracked.told}
-        return of_frame | _hand_facts(first) | side
-    return of_frame | {
-        "state": state_words(first.estimate),
+        "told": tracked.told,
+        "state": state_words(first),
         "lost": all(estimate.lost for estimate in tracked.estimates),
         "hands": [_hand_facts(hand) for hand in tracked.hands],
     }
