@@ -1,10 +1,11 @@
 "use strict";
-// The tracker's estimates as they come, for a page of the same server.
+// The tracker's estimates as they come, for the pages of the same server.
 //
-// follow(take, say): take(hands, line) is called with each line, hands being a record for each hand
-// with what the line says of the frame as a whole; say(phase) with "connecting", "live", "waiting"
-// (no line for a while) and "broken" (the tracker has gone; it is tried again).
+// follow(take): take(hands, line) is called with each line, hands being a record for each hand with
+// what the line says of the frame as a whole. The phase stands in the page's body and #phase.
 const RETRY_MS = 1000, STALE_MS = 2000;
+const WORDS = { live: "live", waiting: "waiting for the tracker", broken: "connection lost; trying again" };
+const by = (id) => document.getElementById(id);
 
 function handsOf(line) {
   if (!line.hands) return [line];
@@ -16,7 +17,13 @@ function lostWords(hand) {
   return hand.state_name === "lost" ? "lost" : `lost (${hand.state_name})`;
 }
 
-function follow(take, say) {
+function say(phase) {
+  if (document.body.dataset.phase === phase) return;
+  document.body.dataset.phase = phase;
+  by("phase").textContent = WORDS[phase];
+}
+
+function follow(take) {
   const address = new URL("/stream", location.href);
   address.protocol = location.protocol === "https:" ? "wss:" : "ws:";
   let stale = 0;
@@ -36,6 +43,5 @@ function follow(take, say) {
       setTimeout(connect, RETRY_MS);
     };
   };
-  say("connecting");
   connect();
 }
