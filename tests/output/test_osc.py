@@ -117,7 +117,7 @@ def test_landmarks_and_the_joints_of_openxr_are_reported_on_demand(receiver: soc
 
 
 def test_a_bad_setting_is_one_clear_error() -> None:
-    with pytest.raises(ToftrackError, match="unknown part 'bones'; give some of joints"):
+    with pytest.raises(ToftrackError, match="stream.parts=bones is unknown; give one of joints"):
         osc_stream(parts=["bones"])
     with pytest.raises(ToftrackError, match="stream.port=0"):
         osc_stream(port=0)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.errors import ToftrackError, module_of_extra
+from toftrack.errors import check_choice, module_of_extra
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
 from toftrack.hand.skeleton import JOINT_NAMES
@@ -44,11 +44,8 @@ class OscStream(UdpStream):
     def __init__(self, host: str, port: int, parts: Sequence[str]) -> None:
         super().__init__(host, port, None)
         self._parts = (parts,) if isinstance(parts, str) else tuple(parts)
-        if unknown := [part for part in self._parts if part not in _PARTS]:
-            raise ToftrackError(
-                f"stream.parts names the unknown part {unknown[0]!r}; give some of "
-                f"{', '.join(_PARTS)}"
-            )
+        for part in self._parts:
+            check_choice("stream.parts", part, tuple(_PARTS))
         self._bundles, self._messages = (
             module_of_extra(f"pythonosc.osc_{kind}_builder", "stream=osc needs python-osc", "osc")
             for kind in ("bundle", "message")

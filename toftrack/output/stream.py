@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import Any, Self
 
-from toftrack.errors import ToftrackError, check_number, reported_errors
+from toftrack.errors import ToftrackError, check_choice, check_number, reported_errors
 from toftrack.frames.estimate import Estimate
 from toftrack.output.lines import LINE_FIELDS, json_line
 
@@ -200,10 +200,6 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
         return LINE_FIELDS
     one = isinstance(fields, str) or not isinstance(fields, Sequence)
     names: tuple[Any, ...] = (fields,) if one else tuple(fields)
-    unknown = [name for name in names if name not in LINE_FIELDS]
-    if unknown or not names:
-        what = f"names the unknown field {unknown[0]!r}" if unknown else "is empty"
-        raise ToftrackError(
-            f"stream.fields {what}; give null for all, or some of {', '.join(LINE_FIELDS)}"
-        )
+    for name in names or (fields,):
+        check_choice("stream.fields", name, LINE_FIELDS, ", or null for all")
     return names
