@@ -89,14 +89,12 @@ def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[
 
 def _relative(position: np.ndarray, turned: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Joints in the world (T, 26, 3) and (T, 26, 4), each in the axes of the one it hangs on."""
-    offset, turn = np.empty_like(position), np.empty_like(turned)
+    offset, turn = position.copy(), turned.copy()
     for joint, parent in enumerate(OPENXR_PARENTS):
-        if parent < 0:
-            offset[:, joint], turn[:, joint] = position[:, joint], turned[:, joint]
-            continue
-        back = Rotation.from_quat(turned[:, parent]).inv()
-        offset[:, joint] = back.apply(position[:, joint] - position[:, parent])
-        turn[:, joint] = (back * Rotation.from_quat(turned[:, joint])).as_quat()
+        if parent >= 0:
+            back = Rotation.from_quat(turned[:, parent]).inv()
+            offset[:, joint] = back.apply(position[:, joint] - position[:, parent])
+            turn[:, joint] = (back * Rotation.from_quat(turned[:, joint])).as_quat()
     return offset, turn
 
 
@@ -159,26 +157,27 @@ def glb_of(motions: list[HandMotion]) -> bytes:
 
 def _add_hand(file: _File, motion: HandMotion) -> None:
     """Nodes, skin, mesh and animation of one hand."""
-    gltf = file.gltf
-    first = len(file.document.nodes) + 1  # of the joints, behind the node that holds them
-    holder = gltf.Node(name=motion.name("hand"), children=[first + _WRIST])
-    file.document.nodes.append(holder)
+    gltf, nodes = file.gltf, file.document.nodes
+    first = len(nodes) + 1  # of the joints, behind the node that holds them
+    nodes.append(gltf.Node(name=motion.name("hand"), children=[first + _WRIST]))
     for joint, name in enumerate(OPENXR_JOINT_NAMES):
-        children = [first + child for child, at in enumerate(OPENXR_PARENTS) if at == joint]
         node = gltf.Node(
             name=motion.name(name),
             translation=motion.offset_m[0, joint].tolist(),
             rotation=motion.turn[0, joint].tolist(),
+            children=[first + child for child, at in enumerate(OPENXR_PARENTS) if at == joint],
         )
-        if children:
-            node.children = children
-        file.document.nodes.append(node)
-    skinned = gltf.Node(
-        name=motion.name("skin"), mesh=_mesh(file, motion), skin=_skin(file, motion, first)
-    )
-    file.document.nodes.append(skinned)
-    file.document.scenes[0].nodes += [first - 1, len(file.document.nodes) - 1]
+        nodes.append(node)
+    mesh, skin = _mesh(file, motion), _skin(file, motion, first)
+    skinned = _added(nodes, gltf.Node(name=motion.name("skin"), mesh=mesh, skin=skin))
+    file.document.scenes[0].nodes += [first - 1, skinned]
     _animate(file, motion, first)
+
+
+def _added(items: list[Any], one: Any) -> int:
+    """Append to a list of the document; returns the number there."""
+    items.append(one)
+    return len(items) - 1
 
 
 def _mesh(file: _File, motion: HandMotion) -> int:
@@ -198,8 +197,8 @@ def _mesh(file: _File, motion: HandMotion) -> int:
     corners = triangles.ravel().astype(np.uint32)
     indices = file.array(corners, gltf.SCALAR, gltf.ELEMENT_ARRAY_BUFFER)
     primitive = gltf.Primitive(attributes=attributes, indices=indices, material=0)
-    file.document.meshes.append(gltf.Mesh(name=motion.name("skin"), primitives=[primitive]))
-    return len(file.document.meshes) - 1
+    mesh = gltf.Mesh(name=motion.name("skin"), primitives=[primitive])
+    return _added(file.document.meshes, mesh)
 
 
 def _skin(file: _File, motion: HandMotion, first: int) -> int:
@@ -212,15 +211,13 @@ def _skin(file: _File, motion: HandMotion, first: int) -> int:
     inverse[:, :3, 3] = -back.apply(position)
     inverse[:, 3, 3] = 1
     columns = inverse.swapaxes(1, 2).reshape(26, 16)
-    file.document.skins.append(
-        gltf.Skin(
-            name=motion.name("skin"),
-            inverseBindMatrices=file.array(columns, gltf.MAT4),
-            skeleton=first + _WRIST,
-            joints=list(range(first, first + 26)),
-        )
+    skin = gltf.Skin(
+        name=motion.name("skin"),
+        inverseBindMatrices=file.array(columns, gltf.MAT4),
+        skeleton=first + _WRIST,
+        joints=list(range(first, first + 26)),
     )
-    return len(file.document.skins) - 1
+    return _added(file.document.skins, skin)
 
 
 def _animate(file: _File, motion: HandMotion, first: int) -> None:
@@ -234,11 +231,9 @@ def _animate(file: _File, motion: HandMotion, first: int) -> None:
         sampler = gltf.AnimationSampler(
             input=time, output=file.array(values, kind), interpolation=steps
         )
-        animation.samplers.append(sampler)
+        number = _added(animation.samplers, sampler)
         target = gltf.AnimationChannelTarget(node=node, path=path)
-        animation.channels.append(
-            gltf.AnimationChannel(sampler=len(animation.samplers) - 1, target=target)
-        )
+        animation.channels.append(gltf.AnimationChannel(sampler=number, target=target))
 
     shown = np.repeat(motion.tracked[:, None].astype(np.float32), 3, 1)
     add(first - 1, "scale", shown, gltf.VEC3, "STEP")
@@ -276,24 +271,20 @@ class _File:
             values = values.astype(np.float32)
         component = types.get(values.dtype.str[1:], self.gltf.FLOAT)
         data = np.ascontiguousarray(values).tobytes()
-        document, rows = self.document, values.reshape(len(values), -1)
-        document.bufferViews.append(
-            self.gltf.BufferView(
-                buffer=0, byteOffset=len(self._data), byteLength=len(data), target=target
-            )
+        rows = values.reshape(len(values), -1)
+        view = self.gltf.BufferView(
+            buffer=0, byteOffset=len(self._data), byteLength=len(data), target=target
         )
         self._data += data + bytes(-len(data) % 4)
-        document.accessors.append(
-            self.gltf.Accessor(
-                bufferView=len(document.bufferViews) - 1,
-                componentType=component,
-                count=len(values),
-                type=kind,
-                min=rows.min(0).tolist() if limits else None,
-                max=rows.max(0).tolist() if limits else None,
-            )
+        accessor = self.gltf.Accessor(
+            bufferView=_added(self.document.bufferViews, view),
+            componentType=component,
+            count=len(values),
+            type=kind,
+            min=rows.min(0).tolist() if limits else None,
+            max=rows.max(0).tolist() if limits else None,
         )
-        return len(document.accessors) - 1
+        return _added(self.document.accessors, accessor)
 
     def content(self) -> bytes:
         """The whole file."""

@@ -18,7 +18,6 @@ The world is the camera's frame: x right, y down, z forward, metres.
 
 from __future__ import annotations
 
-import itertools
 import logging
 import queue
 import socket
@@ -37,6 +36,7 @@ from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_new
 from toftrack.frames.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
+from toftrack.hand.skeleton import JOINT_PARENTS
 from toftrack.render.likelihood import Likelihood
 from toftrack.render.model_image import cpu_surface, parted, posed_hand
 from toftrack.render.segmentation import Observation
@@ -379,13 +379,11 @@ def _bone_strips(
     joints_m: (21, 3).  ok: (21,) bool.
     """
     strips, colours = [], []
-    for finger, colour in enumerate(FINGER_RGB):
-        chain = (0, *range(4 * finger + 1, 4 * finger + 5))
-        for a, b in itertools.pairwise(chain):
-            begin, way = joints_m[a], joints_m[b] - joints_m[a]
-            parts = ((0.0, 1.0),) if ok[b] else _DASHES
-            strips += [np.stack((begin + low * way, begin + high * way)) for low, high in parts]
-            colours += [colour] * len(parts)
+    for joint, parent in enumerate(JOINT_PARENTS[1:], 1):
+        begin, way = joints_m[parent], joints_m[joint] - joints_m[parent]
+        parts = ((0.0, 1.0),) if ok[joint] else _DASHES
+        strips += [np.stack((begin + low * way, begin + high * way)) for low, high in parts]
+        colours += [FINGER_RGB[(joint - 1) // 4]] * len(parts)
     return strips, colours
 
 
