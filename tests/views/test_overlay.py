@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -15,7 +16,9 @@ from helpers.videos import video_frames
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.frames.estimate import Estimate, no_estimate
-from toftrack.views.overlay import CAPTION_PX, VideoView, draw_panel
+from toftrack.hand.shape import default_hand_shape
+from toftrack.views import overlay
+from toftrack.views.overlay import CAPTION_PX, VideoView
 from toftrack.views.skeleton import SLOT_RGB
 
 W, H = 176, 144
@@ -69,16 +72,20 @@ def other_hand(**changes: object) -> Estimate:
 
 
 def panel_sides(
-    *estimates: Estimate, amplitude: np.ndarray | None = AMPLITUDE
+    *estimates: Estimate,
+    amplitude: np.ndarray | None = AMPLITUDE,
+    models: tuple[np.ndarray, ...] = (0 * DEPTH,),
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of a panel without models: the caption and both sides."""
-    return sides(draw_panel(DEPTH, amplitude, CAMERA, estimates, [0 * DEPTH] * len(estimates)))
+    """Of a panel: the caption and both sides.  models: what the hands' surfaces are, (H, W) m."""
+    shapes = [default_hand_shape()] * len(estimates)
+    with patch.object(overlay, "model_range_image", side_effect=models):
+        return sides(overlay.draw_panel(DEPTH, amplitude, CAMERA, estimates, shapes))
 
 
 def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     near, far = np.zeros((H, W)), np.zeros((H, W))
     near[20:80, 100:150], far[20:80, 20:120] = 0.5, 0.6
-    return sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (one, other), (near, far)))
+    return panel_sides(one, other, models=(near, far))
 
 
 def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
@@ -133,7 +140,7 @@ def test_range_image_is_darker_where_nearer_on_white() -> None:
     model = np.zeros((H, W), np.float32)
     model[40:80, 40:80], model[40:80, 100:140] = 0.4, 0.6
     model[0, 0], model[0, 1] = np.nan, np.inf
-    _, _, right = sides(draw_panel(DEPTH, AMPLITUDE, CAMERA, (hand(),), (model,)))
+    _, _, right = panel_sides(hand(), models=(model,))
     near, far, background = right[180, 180, 0], right[180, 360, 0], right[400, 30, 0]
     assert near < far < background == 255
     assert right[1, 1, 0] == right[1, 4, 0] == 255

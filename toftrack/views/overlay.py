@@ -57,16 +57,16 @@ def draw_panel(
     amplitude: np.ndarray | None,
     camera: Camera,
     estimates: Sequence[Estimate],
-    models: Sequence[np.ndarray],
+    shapes: Sequence[HandShape],
 ) -> np.ndarray:
     """One frame as a picture: left the camera's image with the skeleton, right the model's range.
 
     Above the left, frame number, gesture and confidence; above the right, state and score. A red
     caption and frame mark an estimate that is lost, of several hands that all are. The image is the
     amplitude (H, W) in grey, without it depth_m (H, W), nearer brighter; see draw_hands for what is
-    drawn of the slots' estimates. models: of each, (H, W) metres of its surface, 0 = none; nearer
-    is darker, on white, several hands are tinted with their slots' colours. Returns (h, w, 3) uint8
-    BGR, h and w even; the two sides are the halves of w.
+    drawn of the slots' estimates. In the model's range, of hands of these shapes, nearer is darker,
+    on white; several hands are tinted with their slots' colours. Returns (h, w, 3) uint8 BGR, h and
+    w even; the two sides are the halves of w.
     """
     height, width = depth_m.shape
     scale = panel_scale(width)
@@ -74,6 +74,10 @@ def draw_panel(
     size = (max(2, 2 * round(width * scale / 2)), max(2, 2 * round(height * scale / 2)))
     grey = _depth_grey(depth_m) if amplitude is None else _amplitude_grey(amplitude)
     left = _with_hands(grey, amplitude is not None, camera, estimates, size)
+    models = [
+        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
+        for estimate, shape in zip(estimates, shapes, strict=True)
+    ]
     # Nearest, because mixing the hand with the background would draw a dark rim around it.
     right = cv2.resize(_model_picture(models), size, interpolation=cv2.INTER_NEAREST)
     if all(estimate.lost for estimate in estimates):
@@ -117,22 +121,7 @@ def draw_tracked(tracked: TrackedFrame) -> np.ndarray:
     """The panel of a tracked frame; see draw_panel."""
     amplitude = tracked.camera.undistort_amplitude(tracked.frame.amplitude)
     shapes = [hand.shape for hand in tracked.hands]
-    return draw_estimates(tracked.depth_m, amplitude, tracked.camera, tracked.estimates, shapes)
-
-
-def draw_estimates(
-    depth_m: np.ndarray,
-    amplitude: np.ndarray | None,
-    camera: Camera,
-    estimates: Sequence[Estimate],
-    shapes: Sequence[HandShape],
-) -> np.ndarray:
-    """The panel of estimates of hands of these shapes; see draw_panel."""
-    models = [
-        model_range_image(estimate.state, shape, camera.K, camera.height, camera.width)
-        for estimate, shape in zip(estimates, shapes, strict=True)
-    ]
-    return draw_panel(depth_m, amplitude, camera, estimates, models)
+    return draw_panel(tracked.depth_m, amplitude, tracked.camera, tracked.estimates, shapes)
 
 
 class VideoView(View):

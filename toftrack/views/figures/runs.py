@@ -20,7 +20,7 @@ from toftrack.pose_space.base import PoseSpace
 from toftrack.views.classified import CLASS_RGB, CLASSES, classify
 from toftrack.views.figures import chart
 from toftrack.views.figures.poses import scatter_gestures
-from toftrack.views.overlay import draw_estimates, film_tile, filmstrip, range_grey
+from toftrack.views.overlay import draw_panel, film_tile, filmstrip, range_grey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -39,7 +39,7 @@ def _strip(run: Run, footage: Footage, rows: Iterable[int]) -> np.ndarray:
     tiles = []
     for row in rows:
         images = footage.depth(row), footage.amplitude(row)
-        panel = draw_estimates(*images, footage.camera, run.estimates(row), run.shapes)
+        panel = draw_panel(*images, footage.camera, run.estimates(row), run.shapes)
         tiles.append(film_tile(panel))
     return filmstrip(tiles)
 
