@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -136,10 +137,7 @@ class Run:
 
     def pose_space(self) -> PoseSpace:
         """The run's pose space, read or learned anew; ToftrackError when its file is gone."""
-        target, settings = self._settings("pose_space")
-        kind = str(settings.get("kind"))
-        if target != f"{make_pose_space.__module__}.{make_pose_space.__name__}" or "." in kind:
-            raise self._of_its_own("pose space", kind if "." in kind else target)
+        settings = self._settings("pose_space", make_pose_space)
         if settings.get("file"):
             settings["file"] = str(found_again(settings["file"], self._ran_in))
         space = make_pose_space(**settings)
@@ -156,27 +154,26 @@ class Run:
         folder = read_run_facts(self.folder).get("working_folder")
         return None if folder is None else str(folder)
 
-    def _settings(self, group: str) -> tuple[object, dict[str, Any]]:
-        """What a group's settings are for, and these."""
+    def _settings(self, group: str, known: Callable[..., Any]) -> dict[str, Any]:
+        """A group's, which are for what is known here: no file says what is to be executed."""
         settings = self.config.get(group)
         if not isinstance(settings, dict):
             raise ToftrackError(
                 f"'{self.folder / 'track.npz'}' does not say which {group} made it; run "
                 "track.py again with this version"
             )
-        return settings.get("_target_"), {k: v for k, v in settings.items() if k != "_target_"}
-
-    def _of_its_own(self, what: str, target: object) -> ToftrackError:
-        return ToftrackError(
-            f"the run in '{self.folder}' has a {what} of its own, {target}, which a run's files may"
-            " not load; what needs none can be read all the same"
-        )
+        settings = dict(settings)
+        target, kind = settings.pop("_target_", None), str(settings.get("kind"))
+        target = kind if "." in kind else target
+        if target != f"{known.__module__}.{known.__qualname__}":
+            raise ToftrackError(
+                f"the run in '{self.folder}' has a {group.replace('_', ' ')} of its own, {target}, "
+                "which a run's files may not load; what needs none can be read all the same"
+            )
+        return settings
 
     def _made(self, kind: type, group: str) -> Any:
-        """Only kinds that are known here: a file must not say what is to be executed."""
-        target, settings = self._settings(group)
-        if target != f"{kind.__module__}.{kind.__qualname__}":
-            raise self._of_its_own(group, target)
+        settings = self._settings(group, kind)
         # JSON has no word for infinity: a number that is null was one.
         for one in fields(kind):
             if one.type == "float" and settings.get(one.name, 0.0) is None:
