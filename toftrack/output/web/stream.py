@@ -4,7 +4,7 @@
 | --- | --- |
 | `GET /` | a page that draws the hand in 3-D |
 | `GET /point` | a page to point at targets and to pinch them |
-| `GET /feed.js` | what both pages read the stream with |
+| `GET /feed.js`, `GET /page.css` | what both pages read the stream with, and how they look |
 | a websocket to `/stream` | a text message a frame, each as a line of track.jsonl |
 
 What clients send is read and thrown away; who may listen, server.py says.
@@ -23,7 +23,7 @@ from toftrack.output.stream import Stream, known_fields
 from toftrack.output.web.server import ANY_PORT, Client, WebServer
 
 STREAM = "/stream"
-_PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js"}
+_PAGES = {"/": "hand.html", "/point": "point.html", "/feed.js": "feed.js", "/page.css": "page.css"}
 
 
 class WebSocketStream(Stream):
