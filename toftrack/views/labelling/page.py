@@ -67,23 +67,6 @@ class LabelPage:
         points = {name: point for name, point in frame["points"].items() if name in LABELLED}
         return {"number": number, "points": points, "gesture": frame.get("gesture")}
 
-    def change(self, content: dict[str, Any]) -> None:
-        """Do what a message asks for; ValueError for what cannot be meant, ToftrackError where it
-        cannot be written.
-        """
-        if "side" in content:
-            self.labels.set_side(content["side"])
-            return
-        for name, count, change in (
-            ("point", 3, self.labels.set_point),
-            ("gesture", 2, self.labels.set_gesture),
-        ):
-            given = content.get(name)
-            if isinstance(given, list) and len(given) == count:
-                change(*given)
-                return
-        raise ValueError("the message is none that this server knows")
-
 
 def _picture(frame: LabelFrame) -> dict[str, Any]:
     """How a frame is shown; its depth follows."""
@@ -115,15 +98,26 @@ class _Visitor(Client):
             self.tell({"failed": str(error)})
 
     def _answer(self, content: dict[str, Any]) -> None:
-        page = self._page
-        if "about" in content:
-            self.tell({"about": page.about()})
-        elif "frame" in content:
-            number = content["frame"]
-            frame = page.frames.get(number) if isinstance(number, int) else None
-            if frame is None:
+        """Do what a message asks for; ValueError for what cannot be meant, ToftrackError where it
+        cannot be written.
+        """
+        page, labels = self._page, self._page.labels
+        match content:
+            case {"about": _}:
+                self.tell({"about": page.about()})
+                return
+            case {"frame": int(number)} if number in page.frames:
+                frame = page.frames[number]
+                self.tell(_picture(frame), frame.depth_mm.tobytes())
+                return
+            case {"frame": _}:
                 raise ValueError("there is no such frame here")
-            self.tell(_picture(frame), frame.depth_mm.tobytes())
-        else:
-            page.change(content)
-            self.tell({"saved": page.labels.labelled()})
+            case {"side": side}:
+                labels.set_side(side)
+            case {"point": [number, joint, point]}:
+                labels.set_point(number, joint, point)
+            case {"gesture": [number, name]}:
+                labels.set_gesture(number, name)
+            case _:
+                raise ValueError("the message is none that this server knows")
+        self.tell({"saved": labels.labelled()})
