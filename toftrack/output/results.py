@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.errors import MOST_HANDS, ToftrackError
+from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
 from toftrack.files.archives import read_archive
 from toftrack.files.json_text import parse_json, read_json
 from toftrack.files.safe_files import write_whole
@@ -247,7 +247,9 @@ def read_results(path: str | Path) -> dict[str, Any]:
     path = Path(path).expanduser()
     try:
         names = (*KINDS, DROPPED, *_TEXTS)
-        arrays = read_archive(path, set(names), _MOST_BYTES)
+        what = f"the result file '{path}' cannot be read"
+        with reported_errors(what, "give the path of a track.npz"):
+            arrays = read_archive(path, set(names), _MOST_BYTES)
         content: dict[str, Any] = {name: arrays[name] for name in names}
         content["joint_names"] = tuple(content["joint_names"].tolist())
         content["metadata"] = parse_json(content["metadata"].item())
@@ -255,11 +257,6 @@ def read_results(path: str | Path) -> dict[str, Any]:
             raise ValueError("the metadata are no objects")
         content |= facts_for_readers(content["metadata"])
         _check_arrays({name: arrays[name] for name in (*KINDS, DROPPED)})
-    except OSError as error:
-        raise ToftrackError(
-            f"the result file '{path}' cannot be read ({error.strerror or error}); give the path "
-            "of a track.npz"
-        ) from error
     except KeyError as error:
         raise ToftrackError(
             f"'{path}' is not a track.npz of this toftrack (it has no "
@@ -304,15 +301,13 @@ def _check_arrays(arrays: dict[str, np.ndarray]) -> None:
 def read_run_facts(folder: Path) -> dict[str, Any]:
     """The content of a folder's run.json; ToftrackError when there is none that can be used."""
     path = folder / "run.json"
-    try:
+    with reported_errors(f"'{path}' cannot be read", "track again", OSError, ValueError):
+        if not path.exists():
+            raise ToftrackError(
+                f"'{folder}' is not the output folder of a run: it has no run.json; give a folder "
+                "that `toftrack track` wrote, such as outputs/DATE/TIME"
+            )
         facts = read_json(path)
-    except (FileNotFoundError, NotADirectoryError):
-        raise ToftrackError(
-            f"'{folder}' is not the output folder of a run: it has no run.json; give a folder that "
-            "`toftrack track` wrote, such as outputs/DATE/TIME"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise ToftrackError(f"'{path}' cannot be read ({error}); track again") from None
     known = isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
     whole = known and isinstance(facts.get("joint_names"), list)
     if not whole or not _are_metadata(facts.get("metadata")):
