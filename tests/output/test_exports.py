@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from toftrack.frames.estimate import Estimate
 from toftrack.hand.openxr import OPENXR_JOINT_NAMES
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.output.exports import glb_of, hand_mesh, motions_of
+from toftrack.output.run_folder import Run
 
 NAMES = (
     *("timestamp_s", "lost", "side", "joints_m", "state"),
@@ -22,8 +23,9 @@ NAMES = (
 )
 
 
-def results_of(estimates: list[Estimate]) -> dict[str, Any]:
-    return {name: np.array([getattr(one, name) for one in estimates]) for name in NAMES}
+def run_of(estimates: list[Estimate], shape: HandShape) -> Run:
+    results = {name: np.array([getattr(one, name) for one in estimates]) for name in NAMES}
+    return Run(Path(), results, np.arange(len(estimates)), {}, (shape,))
 
 
 def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
@@ -34,12 +36,12 @@ def moving(side: str = "right", lost: tuple[int, ...] = ()) -> list[Estimate]:
 
 def exported(estimates: list[Estimate], side: str) -> Gltf:
     pytest.importorskip("pygltflib", reason="pip install '.[export]'")
-    return Gltf(glb_of(motions_of(results_of(estimates), (default_hand_shape(side=side),))))
+    return Gltf(glb_of(motions_of(run_of(estimates, default_hand_shape(side=side)))))
 
 
 def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
     first, *_ = estimates = moving()  # as long as hands are on average
-    (motion,) = motions_of(results_of(estimates), (default_hand_shape(0.17),))
+    (motion,) = motions_of(run_of(estimates, default_hand_shape(0.17)))
     wrist, metacarpal = map(OPENXR_JOINT_NAMES.index, ("wrist", "little_metacarpal"))
     turned = Rotation.from_quat(motion.turn[0, wrist])
     place = motion.offset_m[0, wrist] + turned.apply(motion.offset_m[0, metacarpal])
@@ -57,7 +59,7 @@ def test_joints_are_where_they_were_before_the_hand_was_fitted() -> None:
 )
 def test_a_clock_that_errs_leaves_frames_of_even_length(times: list[float]) -> None:
     estimates = [replace(one, timestamp_s=at) for one, at in zip(moving(), times, strict=False)]
-    (motion,) = motions_of(results_of(estimates), (default_hand_shape(),))
+    (motion,) = motions_of(run_of(estimates, default_hand_shape()))
     assert np.allclose(motion.time_s, 0.04 * np.arange(len(times)))
 
 

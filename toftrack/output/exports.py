@@ -7,7 +7,6 @@ nothing, which is how glTF hides what is animated, and its pose is held.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from types import ModuleType
@@ -30,6 +29,7 @@ from toftrack.hand.openxr import (
 from toftrack.hand.shape import SIDES, HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import hand_surface
+from toftrack.output.run_folder import Run
 
 _WRIST = OPENXR_JOINT_NAMES.index("wrist")
 
@@ -59,21 +59,16 @@ class HandMotion:
         return f"{joint.title()}_{self.shape.side[0].upper()}{self.suffix}"
 
 
-def motions_of(results: Mapping[str, Any], shapes: Sequence[HandShape]) -> list[HandMotion]:
-    """The hands of a track.npz that were tracked at all; shapes: the run's hands, one a slot.
+def motions_of(run: Run) -> list[HandMotion]:
+    """The hands of a run that were tracked at all.
 
     In a frame that was dropped a hand stays as the row has it, which is as it was before. Raises
     ToftrackError when no slot had a hand that was tracked.
     """
-    names = ("lost", "openxr_position_m", "openxr_orientation", "side")
-    arrays = {name: results[name] for name in names}
-    if arrays["lost"].ndim == 1:
-        arrays = {name: array[:, None] for name, array in arrays.items()}
-    time_s = _times(results["timestamp_s"])
+    time_s = _times(run.timestamp_s)
     found: list[HandMotion] = []
-    for slot in range(arrays["lost"].shape[1]):
-        hand = {name: array[:, slot] for name, array in arrays.items()}
-        motion = _motion(slot, hand, shapes[slot], time_s)
+    for slot in range(len(run.shapes)):
+        motion = _motion(slot, run.slot(slot), time_s)
         if motion is None:
             continue
         # What animates a hand finds its joints by their names.
@@ -106,10 +101,9 @@ def _rest_joints(shape: HandShape) -> tuple[np.ndarray, np.ndarray]:
     return hand.position_m, hand.orientation
 
 
-def _motion(
-    slot: int, hand: dict[str, np.ndarray], shape: HandShape, time_s: np.ndarray
-) -> HandMotion | None:
-    """The motion of a slot's hand, None where it never had one."""
+def _motion(slot: int, run: Run, time_s: np.ndarray) -> HandMotion | None:
+    """The motion of the hand of a run with one slot, None where it never had one."""
+    hand, shape = run.results, run.shape
     # As they are: those of one shape would not be where the hand was before that was fitted.
     position, turned = hand["openxr_position_m"], hand["openxr_orientation"].astype(np.float64)
     tracked = ~hand["lost"].astype(bool) & np.isfinite(position).all((1, 2))

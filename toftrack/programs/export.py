@@ -48,7 +48,7 @@ def export(folder: Path, kind: str) -> list[Path]:
     if kind == "csv":
         contents = {"hand.csv": csv_lines(run.results)}
     else:
-        motions = motions_of(run.results, run.shapes)
+        motions = motions_of(run)
         if kind == "glb":
             contents = {"hand.glb": [glb_of(motions)]}
         else:  # a file has one skeleton
