@@ -105,9 +105,8 @@ def run_doubts(
     k = (metadata.get("camera") or {}).get("K")
     if (metadata.get("hand_shape") or {}).get("fitted") and k is not None:
         for slot, apparent in zip_longest(range(records.slots), apparent_m):
-            shape = _shape(folder, slot)
-            fitted = "" if shape is None else length_doubt(shape, np.array(k))
-            found += [fitted or ("" if apparent is None else apparent_doubt(apparent, np.array(k)))]
+            fitted = length_doubt(_shape(folder, slot), np.array(k))
+            found.append(fitted or apparent_doubt(apparent, np.array(k)))
     return list(filter(None, found))
 
 
@@ -164,20 +163,19 @@ _APPARENT_M = (0.135, 0.215)
 usual."""
 
 
-def length_doubt(shape: HandShape, k: np.ndarray) -> str:
+def length_doubt(shape: HandShape | None, k: np.ndarray) -> str:
     """What speaks against the camera matrix k (3, 3), px, where a hand was fitted; "": nothing."""
-    fitted = shape.fitted
-    if fitted is None:
+    if shape is None or shape.fitted is None:
         return ""
-    length, factor = shape.hand_length_m, math.exp(_SIGMAS * fitted.sigma[0])
+    length, factor = shape.hand_length_m, math.exp(_SIGMAS * shape.fitted.sigma[0])
     if _SMALLEST_M <= length * factor and length / factor <= _LARGEST_M:
         return ""
     return _sentence(f"the fitted hand is {1e3 * length:.0f} mm long", length, k)
 
 
-def apparent_doubt(length_m: float, k: np.ndarray) -> str:
+def apparent_doubt(length_m: float | None, k: np.ndarray) -> str:
     """Likewise by the mean length that the networks gave a hand that was lost in most frames."""
-    if _APPARENT_M[0] <= length_m <= _APPARENT_M[1]:
+    if length_m is None or _APPARENT_M[0] <= length_m <= _APPARENT_M[1]:
         return ""
     return _sentence(f"the hand looks {1e3 * length_m:.0f} mm long", length_m, k)
 
