@@ -159,10 +159,8 @@ class UdpStream(Stream):
         with reported_errors(what, advice, OSError, UnicodeError):
             found = socket.getaddrinfo(str(host), port, type=socket.SOCK_DGRAM)
         # Most receivers listen at IPv4 only, while localhost is often ::1 first.
-        found.sort(key=lambda one: one[0] != socket.AF_INET)
-        family, kind, protocol, _, address = found[0]
-        self._address: Any = address
-        self._kind = family, kind, protocol
+        best = min(found, key=lambda one: one[0] != socket.AF_INET)
+        self._kind, self._address = best[:3], best[4]
         self._reason = ""
 
     def __enter__(self) -> Self:

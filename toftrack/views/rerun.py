@@ -22,6 +22,7 @@ import logging
 import queue
 import socket
 import threading
+from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -128,11 +129,9 @@ class RerunView(View):
         """
         patience_s = None if self._path is not None else _ANSWER_S
         if self._thread.is_alive():
-            try:
+            with suppress(queue.Full):  # the thread is stuck, as is seen below
                 self._frames.put(None, timeout=patience_s)
                 self._thread.join(patience_s and 2 * patience_s)
-            except queue.Full:
-                pass  # the thread is stuck, as is seen below
         if self._left_out:
             _log.warning("view=rerun: the viewer was too slow for %d frames", self._left_out)
             self._left_out = 0
@@ -181,15 +180,12 @@ def _start_viewer(stream: rr.RecordingStream) -> None:
 def _require_answer(address: str) -> None:
     """A connection is made in the background, and would be tried for ever."""
     advice = "start one with `rerun` and give the address that it names, or leave out view.connect"
-    parts = urlsplit(address)
-    try:
+    what = f"view.connect={address} is no address of a viewer, as {_ADDRESS}"
+    with reported_errors(what, advice, ValueError):
+        parts = urlsplit(address)
         host, port = parts.hostname, parts.port or _PORT
-    except ValueError:  # of a port that is no number
-        host, port = None, _PORT
-    if not parts.scheme.startswith("rerun") or not host:
-        raise ToftrackError(
-            f"view.connect={address} is no address of a viewer, as {_ADDRESS}; {advice}"
-        )
+        if not parts.scheme.startswith("rerun") or not host:
+            raise ValueError("it lacks a part")
     with reported_errors(f"no viewer answers at {address}", advice):
         socket.create_connection((host, port), _ANSWER_S).close()
 

@@ -111,19 +111,18 @@ def corners_figure(space: PoseSpace, size: int = 220) -> np.ndarray:
     corners where all are at their maximum or minimum (fig. 4, middle and right); BGR.
     """
     middle = (space.lower + space.upper) / 2
-    columns = [("all at maximum", space.upper, "all at minimum", space.lower)]
-    for d in range(space.dims):
-        top, bottom = middle.clone(), middle.clone()
-        top[d], bottom[d] = space.upper[d], space.lower[d]
-        columns.append((f"{d + 1} at maximum", top, f"{d + 1} at minimum", bottom))
-    tiles = []
-    for name_top, top, name_bottom, bottom in columns:
-        pair = [
-            _captioned(pose_picture(space.decode(latent[None])[0], size), name)
-            for name, latent in ((name_top, top), (name_bottom, bottom))
+    rows = []
+    for name, ends in (("maximum", space.upper), ("minimum", space.lower)):
+        latents = {"all": ends}
+        for d in range(space.dims):
+            latents[str(d + 1)] = middle.clone()
+            latents[str(d + 1)][d] = ends[d]
+        tiles = [
+            _captioned(pose_picture(space.decode(latent[None])[0], size), f"{which} at {name}")
+            for which, latent in latents.items()
         ]
-        tiles.append(np.vstack(pair))
-    return cv2.cvtColor(np.hstack(tiles), cv2.COLOR_GRAY2BGR)
+        rows.append(np.hstack(tiles))
+    return cv2.cvtColor(np.vstack(rows), cv2.COLOR_GRAY2BGR)
 
 
 def _captioned(picture: np.ndarray, text: str) -> np.ndarray:

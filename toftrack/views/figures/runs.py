@@ -194,12 +194,12 @@ def _time(run: Run) -> np.ndarray:
 
 def _draw_score(axes: Axes, run: Run, score: np.ndarray) -> None:
     """Score (T,) and confidence over time, lost frames shaded."""
-    time_s, confidence = _time(run), run.results.get("confidence")
+    time_s, confidence = _time(run), run.results["confidence"]
     chart.label(axes, "time, s", "score")
     chart.shade(axes, time_s, run.results["lost"], chart.SHADE, "lost, says the tracker")
     marker = "o" if len(time_s) == 1 else ""  # which is no line
     axes.plot(time_s, score, marker=marker, color=chart.GREEN, label="score")
-    if confidence is not None and np.isfinite(confidence).any():
+    if np.isfinite(confidence).any():
         axes.plot(time_s, confidence, marker=marker, color=chart.PURPLE, label="confidence")
     axes.set(xlim=_span(time_s), ylim=(0, 1.02))
 
