@@ -158,10 +158,8 @@ class Watch:
     def advice(self, side: str | None, recent: bool = False) -> tuple[str, ...]:
         """Of the function of that name, for each slot; of the run, or of what is recent."""
         every = self.recent if recent else self.facts
-        if len(every) == 1:
-            return advice(every[0], side, self.reach_m)
         return tuple(
-            f"Slot {slot}: {sentence}"
+            f"Slot {slot}: {sentence}" if len(every) > 1 else sentence
             for slot, facts in enumerate(every)
             for sentence in advice(facts, side, self.reach_m)
         )
