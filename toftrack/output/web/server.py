@@ -265,11 +265,10 @@ class WebServer:
         self.clients.add(client)
         sending = asyncio.ensure_future(_send(connection, client))
         try:
-            # Unread messages would hold up a client's pongs.
-            async for message in connection:
-                client.receive(message)
-        except ConnectionClosed:
-            pass
+            with suppress(ConnectionClosed):
+                # Unread messages would hold up a client's pongs.
+                async for message in connection:
+                    client.receive(message)
         finally:
             sending.cancel()
             self.clients.discard(client)

@@ -37,11 +37,11 @@ import numpy as np
 
 from toftrack.compute.threads import small_operations
 from toftrack.errors import ToftrackError, check_number
-from toftrack.frames.estimate import is_vacant, state_words
+from toftrack.frames.estimate import Estimate, is_vacant, state_words
 from toftrack.hand.skeleton import JOINT_NAMES
 from toftrack.output.lines import hand_content, strict
 from toftrack.output.web.server import ANY_PORT, Client, WebServer, request_of, wait
-from toftrack.views.base import COMMANDS, TrackedFrame, TrackedHand, View
+from toftrack.views.base import COMMANDS, TrackedFrame, View
 from toftrack.views.overlay import caption_px, draw_tracked
 
 _SHOWN = (
@@ -170,10 +170,8 @@ class BrowserView(View):
         for_ever = math.isinf(self._linger_s)
         how_long = "until Ctrl-C" if for_ever else f"for {self._linger_s:g} s (Ctrl-C ends it)"
         print(f"that was the last frame; the page stays {how_long}", file=sys.stderr, flush=True)
-        try:
+        with suppress(KeyboardInterrupt):  # everything was done by then
             wait(threading.Event(), self._linger_s)
-        except KeyboardInterrupt:
-            pass  # everything was done by then
 
     def facts(self, picture: bool = False) -> dict[str, Any]:
         """What the page is told: the phase, and of a `picture`, which follows, its frame."""
@@ -270,14 +268,14 @@ def _facts(tracked: TrackedFrame) -> dict[str, Any]:
         "told": tracked.told,
         "state": state_words(first),
         "lost": all(estimate.lost for estimate in tracked.estimates),
-        "hands": [_hand_facts(hand) for hand in tracked.hands],
+        "hands": [_hand_facts(estimate) for estimate in tracked.estimates],
     }
 
 
-def _hand_facts(hand: TrackedHand) -> dict[str, Any]:
-    doubted = [JOINT_NAMES[joint] for joint in np.flatnonzero(~hand.estimate.joint_ok)]
-    state = {"there": not is_vacant(hand.estimate), "state": state_words(hand.estimate)}
-    return state | {"doubted": doubted} | hand_content(hand.estimate, _SHOWN)
+def _hand_facts(estimate: Estimate) -> dict[str, Any]:
+    doubted = [JOINT_NAMES[joint] for joint in np.flatnonzero(~estimate.joint_ok)]
+    state = {"there": not is_vacant(estimate), "state": state_words(estimate)}
+    return state | {"doubted": doubted} | hand_content(estimate, _SHOWN)
 
 
 def _rate(times_s: Sequence[float]) -> float | None:
