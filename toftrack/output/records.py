@@ -167,17 +167,13 @@ class Records:
 
 
 def write_results(
-    path: Path,
-    records: Records,
-    rows: np.ndarray,
-    changed: dict[str, np.ndarray],
-    small: dict[str, np.ndarray],
+    path: Path, records: Records, rows: np.ndarray, arrays: dict[str, np.ndarray]
 ) -> None:
     """Write the `.npz` of some rows of all columns. Raises OSError.
 
-    rows: not decreasing.  changed: arrays in place of columns.  small: further arrays.
+    rows: not decreasing.  arrays: in place of columns of these names, or besides.
     """
-    names = [name for name in KINDS if name not in changed]
+    names = [name for name in KINDS if name not in arrays]
     with _bar("writing the results", len(rows)) as bar:
 
         def pieces(name: str) -> Iterator[np.ndarray]:
@@ -189,7 +185,7 @@ def write_results(
             name: Pieces((len(rows), *records.shape(name)), records.kind(name), pieces(name))
             for name in names
         }
-        write_archive(path, columns | changed | small, _LEVEL)
+        write_archive(path, columns | arrays, _LEVEL)
 
 
 def _bar(words: str, frames: int) -> tqdm:

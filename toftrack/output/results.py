@@ -197,7 +197,7 @@ def finish(
         counted = ~dropped | bool((metadata.get("config") or {}).get("count_dropped"))
         metrics = run_metrics(records, rows, changed["index"], truth, counted)
         summary |= {"metrics": metrics} if metrics else {}
-    write_results(folder / "track.npz", records, rows, changed, small)
+    write_results(folder / "track.npz", records, rows, changed | small)
     _write_json(folder / "summary.json", summary)
     return summary
 
