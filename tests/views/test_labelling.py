@@ -118,6 +118,8 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
     monkeypatch.setattr(sys, "stderr", said)
     from selenium.webdriver.common.action_chains import ActionChains
 
+    ready = "Boolean(view && socket?.readyState === 1)"
+
     def eventual(script: str) -> None:
         eventually(lambda: chromium.execute_script(f"return {script}"))
 
@@ -125,7 +127,8 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         chromium.find_element("xpath", f"//button[text()='{words}']").click()
 
     def click(u: float, v: float) -> ActionChains:
-        x, y = chromium.execute_script(f"return labelling.toPage({u}, {v})")
+        box, at = "const box = canvas.getBoundingClientRect();", f"place({u}, {v})"
+        x, y = chromium.execute_script(f"{box} return {at}.map((p, i) => p + [box.x, box.y][i])")
         chain = ActionChains(chromium, duration=0)
         chain.w3c_actions.pointer_action.move_to_location(round(x), round(y))
         return chain
@@ -135,12 +138,12 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         if not (found := re.search(r"label at: (\S+) \(Ctrl-C ends\)", said.getvalue())):
             return False
         chromium.get(found[1])
-        eventual("window.labelling?.ready")
+        eventual(ready)
         click(*truth[3, 4]).click().perform()
         assert "right or a left" in chromium.find_element("id", "told").text
         press("right hand")
         for name in LABELLED[:-1]:
-            assert chromium.execute_script("return labelling.joint") == name
+            assert chromium.execute_script("return joint") == name
             click(*truth[3, JOINT_NAMES.index(name)]).click().perform()
         click(20, 20).click_and_hold().perform()
         chromium.execute_script("canvas.oncontextmenu(new PointerEvent('contextmenu'))")  # by touch
@@ -152,7 +155,7 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
         eventual("about.frames[0].gesture === 'palm'")
         assert not chromium.find_element("id", "overlay").is_displayed()
         ActionChains(chromium).send_keys("\ue014").perform()
-        eventual("labelling.at === 1 && labelling.ready")
+        eventual(f"at === 1 && {ready}")
         press("Rest not visible")
         eventual("document.getElementById('told').textContent.startsWith('1 of 2 frames saved')")
         for width in (1400, 320):
@@ -160,7 +163,7 @@ def test_a_frame_is_labelled_by_clicks_and_measured(
             wide = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
             assert chromium.execute_script(f"return {wide}") <= 0
         chromium.refresh()  # what was clicked is still there
-        eventual("window.labelling?.ready && about.frames[1].points.wrist[2] === 'absent'")
+        eventual(f"{ready} && about.frames[1].points.wrist[2] === 'absent'")
         assert chromium.get_log("browser") == []
         return True
 

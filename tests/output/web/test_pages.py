@@ -57,7 +57,7 @@ def select(browser: Any, stream: Any, estimate: Estimate) -> np.ndarray:
     def send() -> None:
         stream.send((estimate,))
 
-    reported = f"window.drawn?.index === {estimate.index}"
+    reported = f"/^frame {estimate.index}\\b/.test(by('facts').value)"
     for _ in range(25):  # the view follows the hand smoothly
         shown(browser, reported, send)
     return picture_of(browser)
@@ -96,7 +96,7 @@ def test_the_hand_is_drawn_bends_and_becomes_grey_when_it_is_lost(stream: Any, p
     assert lost.mean() < 0.01  # grey has no colour
     assert "lost" in page.find_element("tag name", "header").text
     both = hand_estimate(9), hand_estimate(9, "left")
-    shown(page, "window.drawn?.hands === 2", lambda: stream.send(both))
+    shown(page, "hands.length === 2", lambda: stream.send(both))
 
 
 def test_a_bone_to_a_joint_that_is_not_ok_is_grey_and_of_one_piece(stream: Any, page: Any) -> None:
@@ -256,7 +256,7 @@ def test_the_view_has_every_hand_in_it(stream: Any, page: Any) -> None:
     one, other = hand_estimate(9), hand_estimate(9, "left")
     apart = replace(other, openxr_position_m=other.openxr_position_m + shift)
     for _ in range(60):
-        shown(page, "window.drawn?.hands === 2", lambda: stream.send((one, apart)))
+        shown(page, "hands.length === 2", lambda: stream.send((one, apart)))
     drawn = picture_of(page)
     columns = np.flatnonzero(drawn.any(0))
     assert 10 < columns[0] and columns[-1] < drawn.shape[1] - 10
@@ -336,7 +336,7 @@ def test_the_docs_client_draws_the_hand_live_and_bends_it(
 def test_the_pages_say_when_the_tracker_has_gone(browser: Any, tmp_path: Path) -> None:
     with part("stream=websocket", "stream", port=0) as stream:
         browser.get(stream.url)
-        shown(browser, "window.drawn", lambda: stream.send((hand_estimate(1),)))
+        shown(browser, "by('facts').value", lambda: stream.send((hand_estimate(1),)))
     gone = "document.body.dataset.phase === 'broken'"
     shown(browser, gone, lambda: None)
     browser.get("data:,")
