@@ -303,6 +303,11 @@ def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
     assert (
         "note: without measurement.png: " in said and "likelihood of its own, os.system, " in said
     )
+    make = "toftrack.pose_space.files.make_pose_space"
+    own = {"pose_space": {"_target_": make, "kind": make}}
+    change(run / "track.npz", metadata=edited(lambda facts: facts["config"].update(own)))
+    with pytest.raises(ToftrackError, match=f"pose space of its own, {make}, "):
+        read_run(run).pose_space()
 
 
 def test_the_command_answers_errors_with_a_sentence(

@@ -164,10 +164,10 @@ class Run:
             )
         settings = dict(settings)
         target, kind = settings.pop("_target_", None), str(settings.get("kind"))
-        target = kind if "." in kind else target
-        if target != f"{known.__module__}.{known.__qualname__}":
+        if target != f"{known.__module__}.{known.__qualname__}" or "." in kind:
+            own = kind if "." in kind else target
             raise ToftrackError(
-                f"the run in '{self.folder}' has a {group.replace('_', ' ')} of its own, {target}, "
+                f"the run in '{self.folder}' has a {group.replace('_', ' ')} of its own, {own}, "
                 "which a run's files may not load; what needs none can be read all the same"
             )
         return settings
