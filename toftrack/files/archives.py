@@ -10,6 +10,7 @@ broken is a ValueError.
 from __future__ import annotations
 
 import bz2
+import copy
 import errno
 import io
 import math
@@ -85,15 +86,11 @@ class Archive:
                 raise ValueError("it is no .npz archive, or cut off")
             self._bytes = stream.seek(0, io.SEEK_END)
             stream.seek(0)
-            self._stream, self._zip = stream, zipfile.ZipFile(stream)
+            self._zip = zipfile.ZipFile(stream)
             self._entries = {
                 entry.filename.removesuffix(".npy"): entry for entry in self._zip.infolist()
             }
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Of all arrays."""
-        return tuple(self._entries)
+        self.names = tuple(self._entries)
 
     def header(self, name: str) -> Header:
         """An array's header, however large the array is."""
@@ -130,31 +127,20 @@ class Archive:
         with broken_is_value_error(name):
             if entry.compress_type not in _METHODS:
                 raise ValueError("its compression is unknown; save it with numpy.savez_compressed")
-            with self._zip.open(entry) as plain:  # its own header, checked
-                packed = entry.compress_type == zipfile.ZIP_BZIP2
-                stream = bz2.BZ2File(_Packed(self._stream, entry)) if packed else plain
+            bzip2 = entry.compress_type == zipfile.ZIP_BZIP2
+            with self._zip.open(_as_packed(entry) if bzip2 else entry) as plain:
+                stream = bz2.BZ2File(plain) if bzip2 else plain
                 header = _header(stream)
                 _check(header, entry, self._bytes)
                 yield stream, header
 
 
-class _Packed(io.RawIOBase):
-    """The bytes of a member of an archive as they are packed."""
-
-    def __init__(self, stream: IO[bytes], entry: zipfile.ZipInfo) -> None:
-        stream.seek(entry.header_offset + 26)
-        name, extra = struct.unpack("<HH", stream.read(4))
-        self._stream, self._left = stream, entry.compress_size
-        self._at = entry.header_offset + 30 + name + extra
-
-    def readable(self) -> bool:
-        return True
-
-    def read(self, size: int = -1) -> bytes:
-        self._stream.seek(self._at)
-        piece = self._stream.read(min(self._left, size if size >= 0 else self._left))
-        self._at, self._left = self._at + len(piece), self._left - len(piece)
-        return piece
+def _as_packed(entry: zipfile.ZipInfo) -> zipfile.ZipInfo:
+    """A member of which zipfile gives the bytes as they are packed."""
+    packed = copy.copy(entry)
+    packed.compress_type, packed.file_size = zipfile.ZIP_STORED, entry.compress_size
+    del packed.CRC  # which is that of the unpacked ones
+    return packed
 
 
 def read_archive(
