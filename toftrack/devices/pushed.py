@@ -36,7 +36,7 @@ class PushDevice(BaseDevice):
         count, time_s = checked_moment(self._count, now)
         image = np.array(depth, copy=True)
         if image.dtype.kind in "iu":
-            raise wrong_unit("the depth image", image, str(image.dtype))
+            raise wrong_unit("the depth image", image)
         if image.shape != (self.camera.height, self.camera.width) or image.dtype.kind != "f":
             raise ToftrackError(
                 f"an image of {image.dtype}, shape {image.shape}, was pushed; give float metres, "

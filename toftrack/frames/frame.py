@@ -36,19 +36,18 @@ _NEAREST_PERCENT = 5
 """So many percent of the readings may be nearer than what is called the nearest."""
 
 
-def wrong_unit(what: str, depth: np.ndarray, kind: str = "") -> ToftrackError:
-    """What is said of depth whose readings' median is no distance in metres.
-
-    depth: all of it, or a part.  kind: of whole numbers, which are no metres whatever they are.
+def wrong_unit(what: str, depth: np.ndarray) -> ToftrackError:
+    """What is said of depth, all of it or a part, whose readings' median is no distance in metres,
+    or that consists of whole numbers, which are no metres whatever they are.
     """
     median, nearest = median_reading(depth), nearest_reading(depth)
-    whole = f"{what} consists of whole numbers ({kind})"
+    whole = f"{what} consists of whole numbers ({depth.dtype})"
     if not median:  # as a camera's first images
         return ToftrackError(
             f"{whole}, of which none is a reading that would tell their unit; give float metres "
             "(0 = no reading)"
         )
-    given = f"{whole}, their median" if kind else f"the median of {what}"
+    given = f"{whole}, their median" if depth.dtype.kind in "iu" else f"the median of {what}"
     if _NEAREST_CM[0] <= nearest < _NEAREST_CM[1] and median <= _LARGEST_CM:
         unit, to_metres = "centimetres", 100
     elif _MILLIMETRES[0] <= median <= _MILLIMETRES[1] and nearest < 1000 * NO_HAND_M:
@@ -191,7 +190,7 @@ def checked_image(depth_m: Any, k: Any) -> tuple[np.ndarray, np.ndarray]:
             f"{depth.shape}; give one frame at a time"
         )
     if depth.dtype.kind in "iu":
-        raise wrong_unit("the depth image", depth, str(depth.dtype))
+        raise wrong_unit("the depth image", depth)
     if depth.dtype.kind != "f":
         raise ToftrackError(f"the depth image must be float32 metres, but is {depth.dtype}")
     with np.errstate(over="ignore"):  # beyond float32 is infinity, and no reading

@@ -18,6 +18,7 @@ MILLIMETRE = 0.001
 MOST = 1e6
 """Of a unit or a rate."""
 _BESIDE = "camera.json"
+_UNIT = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
 
 
 @dataclass(frozen=True)
@@ -107,7 +108,7 @@ def metres_of(words: np.ndarray, unit_m: float) -> np.ndarray:
     return np.where((depth > 0) & (depth < np.inf), depth, np.float32(0))
 
 
-def check_metres(depth_m: np.ndarray, what: str, remedy: str) -> None:
+def check_metres(depth_m: np.ndarray, what: str, remedy: str = _UNIT) -> None:
     """ToftrackError where depth cannot be in metres."""
     median = median_reading(depth_m)
     if median > LARGEST_MEDIAN_M:

@@ -169,9 +169,8 @@ class ImageFolder(FrameStore):
         self.timestamp_s = np.arange(count) / self.fps if times_s is None else times_s
         self.names = tuple(self._depth)
         if not whole:
-            remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
             what = f"the image '{self._depth[0]}' in {files.what}"
-            check_metres(metres_of(first, self.unit_m), what, remedy)
+            check_metres(metres_of(first, self.unit_m), what)
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         depth = metres_of(self._read(self._depth[index], self._kind), self.unit_m)

@@ -296,7 +296,7 @@ def _check_depth(depth: Images, key: str) -> Images:
     some = some_images(depth)
     median = median_reading(some)
     if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
-        raise wrong_unit(f"'{key}'", some, str(depth.dtype) if whole else "")
+        raise wrong_unit(f"'{key}'", some)
     kept = depth.dtype.newbyteorder("=") in (np.float16, np.float32)
     return depth if kept or isinstance(depth, StreamedImages) else depth.astype(np.float32)
 

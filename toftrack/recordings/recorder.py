@@ -196,8 +196,7 @@ class Recorder:
     def _check_unit(self, frame: Frame) -> None:
         """After half a minute it would be too late: nobody reads a recording in another unit."""
         if frame.depth.dtype.kind in "iu":
-            what = f"the depth of frame {frame.index}"
-            raise wrong_unit(what, frame.depth, str(frame.depth.dtype))
+            raise wrong_unit(f"the depth of frame {frame.index}", frame.depth)
         if self._strange >= _STRANGE:
             return
         median = median_reading(frame.depth)

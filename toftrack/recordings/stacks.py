@@ -77,8 +77,7 @@ class Stack(FrameStore):
         self.metadata = {} if given.dataset is None else {"dataset": given.dataset}
         self._images, self._order = images, order
         some = [self.image(i)[0] for i in np.unique(np.linspace(0, count - 1, 8).astype(int))]
-        remedy = "; say how many metres a step is with device.unit_m (convert: --source-unit)"
-        check_metres(np.stack(some), f"'{path}'", remedy)
+        check_metres(np.stack(some), f"'{path}'")
 
     def image(self, index: int) -> tuple[np.ndarray, None]:
         at: list[Any] = [slice(None)] * 3
