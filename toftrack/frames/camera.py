@@ -221,13 +221,17 @@ class Camera:
         if largest_reading(z) == np.inf:
             z = np.where((z > 0) & (z < np.inf), z, np.float32(0))
         if self.depth_polynomial:
-            z = self._corrected(z if radial else z * self._ray_lengths)
+            z = self._corrected(self.to_radial(z, radial))
             z /= self._ray_lengths
         elif radial:
             z = z / self._ray_lengths
         if self._distorted:
             return self._undistort(z)
         return z.copy() if z is measured else z
+
+    def to_radial(self, depth: np.ndarray, radial: bool) -> np.ndarray:
+        """A measured image, (H, W) metres, as distances along the pixels' rays."""
+        return depth if radial else depth * self._ray_lengths
 
     def undistort_amplitude(self, amplitude: np.ndarray | None) -> np.ndarray | None:
         """The (H, W) amplitude image on the grid of `rectify`, of the same type; None stays None.

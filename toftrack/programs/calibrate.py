@@ -29,7 +29,7 @@ from toftrack.frames.camera import Camera
 from toftrack.programs.command_line import plain_parser
 from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ, to_radial
+from toftrack.recordings.sr_frame import DEFAULT_MODULATION_MHZ
 from toftrack.recordings.store import open_with_own_camera
 from toftrack.views.figures import chart
 from toftrack.views.pictures import write_picture
@@ -79,7 +79,7 @@ def main(arguments: Sequence[str]) -> None:
             depth, amplitude = store.image(view.index)
             assert amplitude is not None  # as of the first frame
             # A recording of Z was made with the recording's own camera: that is taken back.
-            images.append((to_radial(depth, store.radial, store.camera), amplitude))
+            images.append((store.camera.to_radial(depth, store.radial), amplitude))
     pairs = calibration.depth_pairs(lens, board, square_m, images)
     found = calibration.fit_depth(pairs)
     camera = replace(

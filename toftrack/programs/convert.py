@@ -29,7 +29,6 @@ from toftrack.recordings.sr_frame import (
     DEFAULT_MODULATION_MHZ,
     REGISTERS,
     encode_frame,
-    to_radial,
     unambiguous_range_m,
 )
 from toftrack.recordings.srs import SrsFacts, SrsInit, SrsRecording, srs_frame, srs_head
@@ -124,7 +123,7 @@ def _to_srs(store: FrameStore, target: Path, range_m: float, bar: tqdm) -> None:
                 data = store.raw(index)
             else:
                 depth, amplitude = store.image(index)
-                radial = to_radial(depth, store.radial, store.camera)
+                radial = store.camera.to_radial(depth, store.radial)
                 data = encode_frame(radial, amplitude, range_m)
             stream.write(srs_frame(data, float(time_s)))
             bar.update()

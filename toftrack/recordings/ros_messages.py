@@ -168,11 +168,10 @@ def camera_of(info: Any, rectified: bool) -> Camera:
     stated = {k: np.asarray(getattr(info, name), np.float64).ravel() for k, name in names.items()}
     K, P, distortion = stated["K"].reshape(3, 3), stated["P"].reshape(3, 4), stated["D"]
     if rectified and P[0, 0] > 0:
-        return Camera(*_window(info, np.diag([P[0, 0], P[1, 1], 1.0]), P[0, 2], P[1, 2]))
-    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        K = P
+    elif not (K[0, 0] > 0 and K[1, 1] > 0):
         raise ToftrackError("it is not calibrated (K is zero); give one with camera.file=FILE")
-    focal = np.diag([K[0, 0], K[1, 1], 1.0])
-    placed = _window(info, focal, K[0, 2], K[1, 2])
+    placed = _window(info, K)
     model = str(info.distortion_model)
     if rectified or not distortion.any() and model != "equidistant":
         return Camera(*placed)
@@ -186,12 +185,11 @@ def camera_of(info: Any, rectified: bool) -> Camera:
     return Camera(*placed, distortion)
 
 
-def _window(info: Any, focal: np.ndarray, cx: float, cy: float) -> tuple[np.ndarray, int, int]:
+def _window(info: Any, stated: np.ndarray) -> tuple[np.ndarray, int, int]:
     """K, columns and rows of the image that is sent: a part of the sensor's, and binned."""
     roi, bins = info.roi, np.maximum(1, (int(info.binning_x), int(info.binning_y)))
     size = np.array((roi.width or info.width, roi.height or info.height), np.int64) // bins
-    K = focal.copy()
-    K[0, 0], K[1, 1] = focal[[0, 1], [0, 1]] / bins
+    K = np.diag([*stated[[0, 1], [0, 1]] / bins, 1.0])
     # As image_geometry has it, without the half pixel by which a bin's centre lies elsewhere.
-    K[:2, 2] = np.array((cx - roi.x_offset, cy - roi.y_offset)) / bins
+    K[:2, 2] = (stated[:2, 2] - (roi.x_offset, roi.y_offset)) / bins
     return K, int(size[0]), int(size[1])

@@ -81,10 +81,3 @@ def encode_frame(radial_m: np.ndarray, amplitude: np.ndarray | None, range_m: fl
     if amplitude is None:
         return distance.tobytes() + bytes(IMAGE_BYTES)
     return distance.tobytes() + amplitude.astype(_WORD).tobytes()
-
-
-def to_radial(depth: np.ndarray, radial: bool, camera: Camera) -> np.ndarray:
-    """A measured image, (H, W) metres, as distances along the pixels' rays."""
-    if radial:
-        return depth
-    return depth * np.sqrt(1 + (camera.normalised_rays() ** 2).sum(axis=-1)).astype(np.float32)

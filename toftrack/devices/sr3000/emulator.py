@@ -25,7 +25,7 @@ from usb.backend import IBackend
 from toftrack.devices.sr3000.transport import UsbSettings, parse_id
 from toftrack.errors import ToftrackError, check_number
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame, to_radial
+from toftrack.recordings.sr_frame import FRAME_BYTES, REGISTERS, encode_frame
 
 _PACKET_BYTES = 512
 """Of a bulk endpoint at high speed."""
@@ -454,7 +454,7 @@ class EmulatedBackend(IBackend):
             return None
         depth, amplitude = source.image(self._position)
         self._position += 1
-        radial_m = to_radial(depth, source.radial, source.camera)
+        radial_m = source.camera.to_radial(depth, source.radial)
         return encode_frame(radial_m, amplitude, self._range_m)
 
 
