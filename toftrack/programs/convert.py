@@ -111,13 +111,13 @@ def convert(
 
 
 def _to_srs(store: FrameStore, target: Path, range_m: float, bar: tqdm) -> None:
-    init, registers = None, None
+    init, registers = SrsInit(), bytes(REGISTERS)
     if isinstance(store, SrsRecording):
         init, registers, range_m = store.init, store.registers, store.range_m
     facts = SrsFacts(range_m, store.camera, store.fps, store.metadata)
     what = f"the recording '{target}' cannot be written"
     with reported_errors(what, "choose another place"), whole_file(target) as stream:
-        stream.write(srs_head(init or SrsInit(), registers or bytes(REGISTERS), facts))
+        stream.write(srs_head(init, registers, facts))
         for index, time_s in enumerate(store.timestamp_s):
             if isinstance(store, SrsRecording):
                 data = store.raw(index)

@@ -50,6 +50,8 @@ _STAMP = int.from_bytes(b"TOFS", "little")
 _PAIR = struct.Struct("<II")
 _THREE = struct.Struct("<III")
 _SECONDS = struct.Struct("<d")
+_HEAD = {_INIT: ("Init", _THREE.size), _CONFIGURE: ("Configure", REGISTERS)}
+"""What must come before a frame, and how long it is; the first of each counts."""
 _LARGEST_FACTS = 1 << 20  # bytes; a damaged size must not make us read a gigabyte as text
 
 
@@ -191,9 +193,7 @@ class SrsRecording(FrameStore):
 
     def __init__(self, path: Path, modulation_mhz: int = DEFAULT_MODULATION_MHZ) -> None:
         self.path, default_range_m = file_of(path), unambiguous_range_m(modulation_mhz)
-        self.init: SrsInit | None = None
-        self.registers: bytes | None = None
-        """The first Configure object's 64 bytes."""
+        self._head: dict[int, bytes] = {}
         self._facts = SrsFacts()
         self._stream: BinaryIO | None = None
         self._offsets: list[int] = []
@@ -207,6 +207,8 @@ class SrsRecording(FrameStore):
             raise ToftrackError(
                 f"the recording '{path}' has no whole frame{reason}; record it again"
             )
+        self.init = SrsInit(*_THREE.unpack(self._head[_INIT]))
+        self.registers = self._head[_CONFIGURE]
         facts, stamps = self._facts, np.array(self._stamps, np.float64)
         usable = np.isfinite(stamps).all() and (np.diff(stamps) >= 0).all()
         self.camera, self.metadata = facts.camera or nominal_camera(), facts.metadata
@@ -276,8 +278,8 @@ class SrsRecording(FrameStore):
             self.damage = "cut off behind a time stamp"
 
     def _frame(self, position: int, length: int, stamp: float) -> None:
-        for name, missing in (("Init", self.init is None), ("Configure", self.registers is None)):
-            if missing:
+        for one, (name, _) in _HEAD.items():
+            if one not in self._head:
                 raise ToftrackError(
                     f"the recording '{self.path}' has a frame before its {name} object, which "
                     "breaks the format; record it again"
@@ -292,16 +294,13 @@ class SrsRecording(FrameStore):
         self._stamps.append(stamp)
 
     def _other(self, kind: int, stream: BinaryIO, length: int) -> None:
-        if kind == _INIT and self.init is None:
-            if length != _THREE.size:
-                raise ToftrackError(f"the Init object of '{self.path}' is damaged; record it again")
-            self.init = SrsInit(*_THREE.unpack(stream.read(length)))
-        elif kind == _CONFIGURE and self.registers is None:
-            if length != REGISTERS:
+        if kind in _HEAD and kind not in self._head:
+            name, size = _HEAD[kind]
+            if length != size:
                 raise ToftrackError(
-                    f"the Configure object of '{self.path}' is damaged; record it again"
+                    f"the {name} object of '{self.path}' is damaged; record it again"
                 )
-            self.registers = stream.read(length)
+            self._head[kind] = stream.read(length)
         elif kind == _FACTS and length <= _LARGEST_FACTS:
             self._facts = _parse_facts(self.path, stream.read(length))
 
