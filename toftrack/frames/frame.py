@@ -15,7 +15,7 @@ from toftrack.frames.camera import Camera, largest_reading
 from toftrack.frames.help_text import fields_in_help
 
 # No hand is tracked at 20 m, while 20 mm is nearer than any depth camera sees.
-LARGEST_MEDIAN_M, SMALLEST_MEDIAN_M = 20.0, 0.02
+LARGEST_MEDIAN_M, _SMALLEST_MEDIAN_M = 20.0, 0.02
 _FULL_WORDS = (65.535, 65_535.0)
 """What many cameras say where there is no reading, as everywhere before a covered lens: the largest
 16-bit word, in metres and in millimetres."""
@@ -66,6 +66,12 @@ def wrong_unit(what: str, depth: np.ndarray) -> ToftrackError:
 def median_reading(depth: np.ndarray) -> float:
     """The median of what is a reading, in the unit that it has; 0 where there is none."""
     return _percentile(depth, 50)
+
+
+def could_be_metres(depth: np.ndarray) -> bool | None:
+    """Whether its readings can be metres; None where there is none."""
+    median = median_reading(depth)
+    return _SMALLEST_MEDIAN_M <= median <= LARGEST_MEDIAN_M if median else None
 
 
 def nearest_reading(depth: np.ndarray) -> float:

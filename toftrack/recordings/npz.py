@@ -35,13 +35,7 @@ from toftrack.files.archives import MOST_BYTES, Archive, Header, PickledError, P
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.camera import Camera
-from toftrack.frames.frame import (
-    LARGEST_MEDIAN_M,
-    SMALLEST_MEDIAN_M,
-    Truth,
-    median_reading,
-    wrong_unit,
-)
+from toftrack.frames.frame import LARGEST_MEDIAN_M, Truth, could_be_metres, wrong_unit
 from toftrack.recordings.bare import NOTHING_GIVEN, Given
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, rate_of, reading
 
@@ -294,8 +288,7 @@ def _check_depth(depth: Images, key: str) -> Images:
     if 0 in depth.shape:
         raise ToftrackError(f"'{key}' is empty, shape {depth.shape}; record at least one frame")
     some = some_images(depth)
-    median = median_reading(some)
-    if whole or median > LARGEST_MEDIAN_M or 0 < median < SMALLEST_MEDIAN_M:
+    if whole or could_be_metres(some) is False:
         raise wrong_unit(f"'{key}'", some)
     kept = depth.dtype.newbyteorder("=") in (np.float16, np.float32)
     return depth if kept or isinstance(depth, StreamedImages) else depth.astype(np.float32)

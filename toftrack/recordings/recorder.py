@@ -20,14 +20,7 @@ import numpy as np
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import check_replaceable
 from toftrack.frames.camera import Camera
-from toftrack.frames.frame import (
-    LARGEST_MEDIAN_M,
-    LEAP_S,
-    SMALLEST_MEDIAN_M,
-    Frame,
-    median_reading,
-    wrong_unit,
-)
+from toftrack.frames.frame import LEAP_S, Frame, could_be_metres, wrong_unit
 from toftrack.recordings.unfinished import (
     IMAGE_TYPES,
     SUFFIX,
@@ -199,10 +192,10 @@ class Recorder:
             raise wrong_unit(f"the depth of frame {frame.index}", frame.depth)
         if self._strange >= _STRANGE:
             return
-        median = median_reading(frame.depth)
-        if SMALLEST_MEDIAN_M <= median <= LARGEST_MEDIAN_M:
+        fitting = could_be_metres(frame.depth)
+        if fitting:
             self._strange = _STRANGE
-        elif median:
+        elif fitting is False:
             self._strange += 1
             if self._strange == _STRANGE:
                 raise wrong_unit(f"the depth of the first {_STRANGE} frames", frame.depth)
