@@ -23,7 +23,7 @@ from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.data.pose_data import basic_pose
 from toftrack.render.closed_form import render_range_images
 
-_WIDTH, _HEIGHT, _FOCAL_PX = 176, 144, 200.0
+_CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), 176, 144)
 _WALL_M = 1.5
 _AMPLITUDE_AT_1M = 700.0
 
@@ -46,16 +46,7 @@ class Synthetic(BaseDevice):
         check_number("device.frames", frames, 1, whole=True)
         check_number("device.fps", fps, 0, above=True)
         check_number("device.noise_m", noise_m, 0)
-        camera = (
-            Camera.load(camera_file)
-            if camera_file
-            else Camera(
-                np.array([[_FOCAL_PX, 0, _WIDTH / 2], [0, _FOCAL_PX, _HEIGHT / 2], [0, 0, 1.0]]),
-                _WIDTH,
-                _HEIGHT,
-            )
-        )
-        super().__init__(camera, fps, frames)
+        super().__init__(Camera.load(camera_file) if camera_file else _CAMERA, fps, frames)
         self._count = frames
         self.description = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
         self._noise_m, self._seed = noise_m, seed

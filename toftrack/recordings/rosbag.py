@@ -102,14 +102,10 @@ class RosBag(FrameStore):
 
     def image(self, index: int) -> tuple[np.ndarray, None]:
         if self._messages is None or index != self._next:
-            self._go_to(index)
-        assert self._messages is not None
-        try:
-            _, message = next(self._messages)
-        except StopIteration:
-            raise ToftrackError(
-                f"'{self.path}' ended while it was read; is it still being copied?"
-            ) from None
+            self._messages = self._from(index)
+        _, message = next(self._messages, (0, None))
+        if message is None:
+            raise ToftrackError(f"'{self.path}' ended while it was read; is it still being copied?")
         self._next = index + 1
         depth = self._metres(message, index)
         if depth.shape != (self.camera.height, self.camera.width):
@@ -132,13 +128,11 @@ class RosBag(FrameStore):
                 f"{error}"
             ) from None
 
-    def _go_to(self, index: int) -> None:
+    def _from(self, index: int) -> Iterator[tuple[int, Any]]:
         start_ns = int(self._recorded_ns[index])
-        self._messages = self._bag.messages(self._topic.name, self._topic.kind, start_ns)
+        messages = self._bag.messages(self._topic.name, self._topic.kind, start_ns)
         # Several messages may have been recorded at the same time.
-        before = index - int(np.searchsorted(self._recorded_ns, start_ns))
-        for _ in islice(self._messages, before):
-            pass
+        return islice(messages, index - int(np.searchsorted(self._recorded_ns, start_ns)), None)
 
 
 @dataclass(frozen=True, eq=False)

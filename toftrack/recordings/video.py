@@ -108,8 +108,7 @@ class Track:
             *_errors(),
         ):
             if self._images is None or number != self._next:
-                self._go_to(number)
-            assert self._images is not None
+                self._images = self._from(number)
             image = next((frame for frame in self._images if frame.pts >= self.ticks[number]), None)
             self._next = number + 1
             if image is not None and image.pts == self.ticks[number]:
@@ -121,12 +120,12 @@ class Track:
         if container is not None:
             container.close()
 
-    def _go_to(self, number: int) -> None:
+    def _from(self, number: int) -> Iterator[Any]:
         if self._container is None:
             self._container = _opened(self._path)
         stream = self._container.streams[self._stream]
         self._container.seek(int(self.ticks[number]), stream=stream)
-        self._images = self._container.decode(stream)
+        return self._container.decode(stream)
 
 
 def _opened(path: Path) -> Any:

@@ -261,15 +261,13 @@ def _size(profile: Any) -> tuple[int, int, int]:
 def _infrared_of(rs: ModuleType, profiles: list[Any], depth: Any) -> Any | None:
     # 8 bits first: the 16-bit images of stereo cameras are for calibration and not rectified. The
     # left camera (number 1) first: the depth images lie on its pixels.
-    for wanted in (rs.format.y8, rs.format.y16):
-        fitting = [
-            p
-            for p in _of_kind(profiles, rs.stream.infrared, wanted)
-            if _size(p) == _size(depth) and p.stream_index() < 2
-        ]
-        if fitting:
-            return fitting[0]
-    return None
+    fitting = (
+        p
+        for wanted in (rs.format.y8, rs.format.y16)
+        for p in _of_kind(profiles, rs.stream.infrared, wanted)
+        if _size(p) == _size(depth) and p.stream_index() < 2
+    )
+    return next(fitting, None)
 
 
 def camera_of(rs: ModuleType, intrinsics: Any) -> Camera:
