@@ -144,7 +144,7 @@ def _record_raw(device: Sr3000, options: argparse.Namespace) -> None:
             bar.update()
             if writer.frames == options.frames:
                 break
-            if writer.size_bytes >= 1e9 * options.limit:
+            if writer.bytes >= 1e9 * options.limit:
                 print(
                     f"the recording '{options.out}' ends after {writer.frames} frames: it reached "
                     f"its limit, {options.limit:g} GB",

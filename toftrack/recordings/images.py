@@ -52,6 +52,11 @@ def decoded_png(content: bytes) -> np.ndarray | None:
     width, height = _SIZE.unpack_from(content, 16)
     if not 0 < width * height <= LARGEST_PIXELS:
         return None
+    return decoded(content)
+
+
+def decoded(content: bytes) -> np.ndarray | None:
+    """What OpenCV makes of a file's bytes whose size was checked; None where they are damaged."""
     try:
         return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
@@ -223,10 +228,7 @@ def decoded_depth(content: bytes) -> np.ndarray:
     elif len(pages) > 1 and len(set(pages)) == 1:
         raise ValueError(f"it is a stack of {len(pages)} images: give it by itself")
     elif pages:
-        try:
-            image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            pass
+        image = decoded(content)
     if image is None or image.ndim != 2:
         raise ValueError("it is damaged, or of another kind than its name says")
     return image if image.dtype == np.uint16 else image.astype(np.float32)

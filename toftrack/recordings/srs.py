@@ -116,7 +116,7 @@ def srs_frame(data: bytes, timestamp_s: float) -> bytes:
     return _object(_STAMP, _SECONDS.pack(timestamp_s)) + _object(_FRAME, data)
 
 
-class SrsWriter:
+class SrsWriter(GrowingFile):
     """Appends frames to a new `.srs` file; use it with `with`.
 
     Each frame reaches the operating system before `append` returns, so that a killed program leaves
@@ -143,16 +143,12 @@ class SrsWriter:
             )
         what = f"the recording '{self.path}' cannot be written"
         with reported_errors(what, "choose another place"):
-            self._file = GrowingFile(self.path, overwrite)
+            super().__init__(self.path, overwrite)
         try:
             self._write(srs_head(init or SrsInit(), registers, facts or SrsFacts()))
         except BaseException:
             self.close()
             raise
-
-    @property
-    def size_bytes(self) -> int:
-        return self._file.bytes
 
     def append(self, data: bytes, timestamp_s: float) -> None:
         """Add a raw frame, FRAME_BYTES bytes, received at `timestamp_s`. ToftrackError when it
@@ -163,7 +159,7 @@ class SrsWriter:
 
     def close(self) -> None:
         """Without a frame there is no file."""
-        self._file.close()
+        super().close()
         if not self.frames:
             self.path.unlink(missing_ok=True)
 
@@ -177,7 +173,7 @@ class SrsWriter:
         what = f"the recording '{self.path}' cannot be written any further"
         kept = f"; its {self.frames} whole frames are kept" * bool(self.frames)
         with reported_errors(what, f"free some space{kept}"):
-            self._file.write(content)
+            self.write(content)
 
 
 class SrsRecording(FrameStore):

@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, module_of_extra, reported_errors
@@ -27,7 +26,7 @@ from toftrack.recordings.bare import (
     size_of,
 )
 from toftrack.recordings.frame_store import DEFAULT_FPS, FrameStore, file_of, reading
-from toftrack.recordings.images import pages_of, tiff_of_page
+from toftrack.recordings.images import decoded, pages_of, tiff_of_page
 from toftrack.recordings.matlab import matlab_variables, read_matlab
 
 _PYTHONS, _MATLABS, _REVERSED = (0, 1, 2), (2, 0, 1), (0, 2, 1)
@@ -145,7 +144,7 @@ class _Tiff:
     def __getitem__(self, at: tuple[Any, ...]) -> np.ndarray:
         with open_to_read(self._path) as stream:
             content = tiff_of_page(stream, self._pages[int(at[0])])
-        found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+        found = decoded(content)
         if found is None or found.shape != self.shape[1:]:
             raise ValueError("OpenCV cannot decode it")
         return found
