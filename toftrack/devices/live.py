@@ -95,13 +95,16 @@ def chosen_profile(offered: Sequence[T], size_of: Callable[[T], Size], size: Siz
 
 
 class SdkCamera(BaseDevice):
-    """A camera behind a vendor's SDK, or a recording of that SDK.
+    """A camera behind a vendor's SDK, or a recording of that SDK: depth as Z along the optical
+    axis, infrared as amplitude, by the camera's own intrinsics.
 
     The index is the camera's frame number, counted from the first frame; what was dropped leaves a
     gap. Leaving the iteration stops the camera, another iteration starts it again.
 
     A kind of camera says in `__init__` what it is (after `_begin`, by `_set_up`), and how the SDK
-    is asked in the abstract methods.
+    is asked in the abstract methods. Making one raises ToftrackError: a setting makes no sense, the
+    SDK is not installed, there is no camera, the recording cannot be used, or there are no depth
+    images of that size.
     """
 
     kind: str

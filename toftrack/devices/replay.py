@@ -23,21 +23,16 @@ _log = logging.getLogger(__name__)
 
 
 class Replay(BaseDevice):
-    """The frames of a recording, from `start` up to but not including `stop`.
+    """The frames of a recording of any kind; the arguments are those of conf/device/replay.yaml.
 
     Each frame keeps its index within the recording; `truth` is that of the range. With `repeat`
     indices and timestamps go on counting from one round to the next, as a camera's would; there is
     no last frame then, so `frames` is None, and so is `truth`, which has a row for each of them.
 
-    A `.npz` is loaded; everything else is read frame by frame, so that long ones need no more
-    memory than short ones.
-
-    path: of any kind that `open_recording` knows.  realtime: wait for each frame's time, counted
-    from when the first one is done, and drop a frame when the next one is already due (the last is
-    always delivered); otherwise every frame, as fast as it is asked for.  store: the recording,
-    where it is open already.  given: the fields of `Given`, what the recording does not say itself,
-    and another camera instead of its own. Raises ToftrackError: the recording or the camera cannot
-    be used, or the range lies outside.
+    realtime: each frame has its time, counted from when the first one is done, and is dropped when
+    the next one is already due (the last is always delivered).  store: the recording, where it is
+    open already.  given: the fields of `Given`; a camera goes before the recording's own. Raises
+    ToftrackError: the recording or the camera cannot be used, or the range lies outside.
     """
 
     def __init__(

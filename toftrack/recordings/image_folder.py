@@ -1,19 +1,4 @@
-"""A folder of depth images, or a `.zip` of one, with a camera file.
-
-| file | content |
-| --- | --- |
-| `*.png`, `*.tif`, `*.exr` | one depth image a frame, grey of 16 bits or floats, by name |
-| `amplitude*.png` | optional: the amplitude images, 16 bits, as many and in the same order |
-| `camera.json` | the camera as `Camera.save` writes it, and more keys, see below |
-| `timestamps.txt` | optional: the frames' times, seconds, a line each |
-
-Images of colours or of 8 bits beside them are left out, and, where names have "depth" in them,
-those that have not. Numbers in names go by value. The images may all lie in one folder of that
-folder.
-
-The optional further keys of `camera.json`: `depth_unit_m` (metres of one step, 0.001; of floats,
-1), `radial` (false), `fps` (25), `metadata` (an object).
-"""
+"""A folder of depth images, or a `.zip` of one, with a camera file; see docs/formats.md."""
 
 from __future__ import annotations
 

@@ -1,23 +1,6 @@
 """Recordings as plain `.npz` archives: arrays and text, never pickled objects.
 
-| key | shape, type | required |
-| --- | --- | --- |
-| `depth_m` or `radial_m` | (T, H, W) float16 or float32, metres, 0 = no reading | one of them |
-| `K` | (3, 3) float, pixels | yes |
-| `amplitude` | (T, H, W) uint16 | no |
-| `fps` | scalar | no: from the time stamps, else 25 |
-| `timestamp_s` | (T,) float64 | no: from `fps` |
-| `distortion` | (4, 5, 8, 12 or 14,) float, OpenCV's k1 k2 p1 p2 k3 ... | no: zeros |
-| `lens` | text, `opencv` or `fisheye` | no: `opencv` |
-| `depth_polynomial`, `depth_polynomial_range_m` | (n,), (2,) float, see `Camera` | no: none |
-| `joints_m` | (T, 21, 3) float | no |
-| `visible`, `in_space` | (T,) bool | no: true |
-| `visible_fraction`, `joint_visible` | (T,) float, (T, 21) bool | no |
-| `pose_name` | (T,) text | no |
-| `joints2_m`, `visible2`, `in_space2`, ... | the same of the other hand | no |
-| `metadata` | text, a JSON object | no; of the truth: `side`, `side2`, `still` |
-
-Unknown keys are ignored.
+docs/formats.md says what each key holds.
 """
 
 from __future__ import annotations

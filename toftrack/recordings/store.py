@@ -61,12 +61,8 @@ _READ = "a folder of images, .npz, .zip, .npy, .tif, .h5, .mat, .mkv, .avi, .bag
 
 
 def open_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> FrameStore:
-    """Open a recording, whose kind follows from its name, with the camera that is given, or its
-    own. Only `.npz` is loaded as a whole.
-
-    path: `.npz`, `.srs`, a folder or `.zip` of images, a ROS bag (`.bag`, `.mcap`, `.db3`, a folder
-    with metadata.yaml), a video (`.mkv` of an Azure Kinect, 16-bit FFV1), a stack (`.npy`, `.tif`,
-    `.h5`, `.mat`), or of a suffix that an installed package reads (docs/extending.md). Raises
+    """Open a recording of a kind in docs/formats.md, or that an installed package reads, by its
+    name, with the camera that is given, or its own. Only `.npz` is loaded as a whole. Raises
     ToftrackError: it cannot be used, or it says itself what is given; one sentence that names it.
     """
     store = open_with_own_camera(path, given)

@@ -37,12 +37,7 @@ _SLICE_S = 0.1  # of waiting, between looks at what else may have happened
 
 
 class Orbbec(SdkCamera):
-    """Depth as Z along the optical axis, infrared as amplitude, by the camera's own intrinsics.
-
-    The arguments are those of conf/device/orbbec.yaml. Raises ToftrackError: a setting makes no
-    sense, pyorbbecsdk2 is not installed, there is no camera, the recording cannot be used, or there
-    are no depth images of that size.
-    """
+    """The arguments are those of conf/device/orbbec.yaml."""
 
     kind, maker = "orbbec", "Orbbec"
 

@@ -29,12 +29,7 @@ _ROS_TOPICS = "; a bag of ROS topics goes without: toftrack track FILE"
 
 
 class RealSense(SdkCamera):
-    """Depth as Z along the optical axis, infrared as amplitude, by the camera's own intrinsics.
-
-    The arguments are those of conf/device/realsense.yaml. Raises ToftrackError: a setting makes no
-    sense, pyrealsense2 is not installed, there is no camera, the recording cannot be used, or there
-    are no depth images of that size.
-    """
+    """The arguments are those of conf/device/realsense.yaml."""
 
     kind, maker = "realsense", "RealSense"
 
