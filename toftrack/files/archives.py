@@ -48,7 +48,6 @@ _BROKEN = (
     SyntaxError,
     tokenize.TokenError,
     OverflowError,
-    MemoryError,
     UnicodeError,
     TypeError,
 )

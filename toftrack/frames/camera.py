@@ -64,7 +64,7 @@ def _check_plausible(K: np.ndarray, width: int, height: int) -> None:
     (fx, fy), (cx, cy), size = K[[0, 1], [0, 1]], K[:2, 2], max(width, height)
     longest = _LONGEST * max(size, _TINY_PX)
     focal = all(_SHORTEST * size <= f <= longest for f in (fx, fy))
-    square = 1 / _MOST_OBLONG <= fx / fy <= _MOST_OBLONG
+    square = max(fx, fy) <= _MOST_OBLONG * min(fx, fy)
     # Of a part of a larger image the centre may lie outside, but not far beside the view, too.
     aside = abs(np.array([width / 2 - cx, height / 2 - cy]))
     far = (aside > _FARTHEST_ASIDE * size) & (aside > (fx, fy))
@@ -118,11 +118,6 @@ class Camera:
 
     def __post_init__(self) -> None:
         K = _numbers(self.K, (3, 3), "the camera matrix K")
-        if K[0, 0] <= 0 or K[1, 1] <= 0:
-            raise ToftrackError(
-                f"the camera matrix K must have positive focal lengths, but they are {K[0, 0]:g} "
-                f"and {K[1, 1]:g} pixels"
-            )
         if K[0, 1] or K[1, 0] or K[2, 0] or K[2, 1] or K[2, 2] != 1:
             raise ToftrackError(
                 "the camera matrix K must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], without skew"
