@@ -47,34 +47,19 @@ class Synthetic(BaseDevice):
         check_number("device.fps", fps, 0, above=True)
         check_number("device.noise_m", noise_m, 0)
         super().__init__(Camera.load(camera_file) if camera_file else _CAMERA, fps, frames)
-        self._count = frames
         self.description = {"device": "synthetic", "noise_m": noise_m, "seed": seed}
         self._noise_m, self._seed = noise_m, seed
         shape = default_hand_shape()
-        pose = forward_kinematics(self._states(), shape)
+        pose = forward_kinematics(_states(frames), shape)
         self._ellipsoids = hand_surface(shape).pose(pose)
         yes = np.ones(frames, bool)
         self.truth = Truth(pose.joints_m.numpy(), yes, yes)
-
-    def _states(self) -> torch.Tensor:
-        phase = torch.arange(self._count) / 50.0 * 2 * math.pi
-        closing = (0.5 - 0.5 * phase.cos())[:, None].double()
-        angles = torch.lerp(basic_pose("palm"), basic_pose("fist"), closing).float()
-        position = torch.stack(
-            (
-                0.05 * phase.sin(),
-                0.085 + 0.02 * (1.3 * phase).sin(),
-                0.5 + 0.04 * (0.7 * phase).sin(),
-            )
-        ).T
-        turn = torch.stack((0.1 * phase.sin(), 0.3 * (0.8 * phase).sin(), 0.2 * phase.sin())).T
-        return torch.cat((position, turn, angles), 1)
 
     def __iter__(self) -> Iterator[Frame]:
         generator = np.random.default_rng(self._seed)
         camera, (centres, axes) = self.camera, self._ellipsoids
         k = torch.tensor(camera.K, dtype=torch.float32)
-        for index in range(self._count):
+        for index in range(len(centres)):
             hand = Ellipsoids(centres[index : index + 1], axes[index : index + 1])
             with small_operations():
                 depth = render_range_images(hand, k, camera.height, camera.width)[0].numpy()
@@ -88,3 +73,13 @@ class Synthetic(BaseDevice):
                 amplitude=amplitude,
                 radial=False,
             )
+
+
+def _states(count: int) -> torch.Tensor:
+    phase = torch.arange(count) / 50.0 * 2 * math.pi
+    closing = (0.5 - 0.5 * phase.cos())[:, None].double()
+    angles = torch.lerp(basic_pose("palm"), basic_pose("fist"), closing).float()
+    x, y = 0.05 * phase.sin(), 0.085 + 0.02 * (1.3 * phase).sin()
+    z = 0.5 + 0.04 * (0.7 * phase).sin()
+    turn = 0.1 * phase.sin(), 0.3 * (0.8 * phase).sin(), 0.2 * phase.sin()
+    return torch.cat((torch.stack((x, y, z, *turn), 1), angles), 1)
