@@ -79,38 +79,6 @@ class _Chunk:
     """Instead of data: the errno of a failed transfer."""
 
 
-def _transfer(
-    fault: str | None, data: bytes, ready_s: float, split: int, random: np.random.Generator
-) -> list[_Chunk]:
-    """What comes over the wire for a frame at `ready_s`.
-
-    fault: one of _REQUEST_FAULTS under which something comes, or None.  split: how many frames came
-    in two transfers so far.  random: of the garbage.
-    """
-    whole = memoryview(data)
-    if fault == "overflow":
-        return [_Chunk(ready_s, error=errno.EOVERFLOW)]
-    if fault == "short":
-        return [_Chunk(ready_s, whole[:50_001], ends=True)]
-    if fault == "cut":
-        return [_Chunk(ready_s, whole[: 99 * _PACKET_BYTES])]
-    if fault == "empty":
-        return [_Chunk(ready_s, ends=True)]
-    if fault == "long":
-        return [_Chunk(ready_s, memoryview(data + b"\xa5" * 700), ends=True)]
-    if fault == "split":
-        at = (1 + split % (_PACKETS - 1)) * _PACKET_BYTES
-        return [_Chunk(ready_s, whole[:at], ends=True), _Chunk(ready_s, whole[at:])]
-    if fault in ("unplug_during", "unplug_after"):
-        came = whole[: 50 * _PACKET_BYTES] if fault == "unplug_during" else whole
-        return [_Chunk(ready_s, came), _Chunk(ready_s, error=errno.ENODEV)]
-    if fault == "garbage":
-        whole = memoryview(random.bytes(FRAME_BYTES))
-    elif fault in ("zeros", "ones"):
-        whole = memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES)
-    return [_Chunk(ready_s, whole)]
-
-
 def _parse_faults(texts: Iterable[str]) -> list[tuple[str, float, float]]:
     """Faults written as KIND (always), KIND@7 (once), KIND@7x3 (thrice) or KIND@7+ (from then on):
     the kind, and the numbers of the first and the last attempt or request that it hits.
@@ -443,8 +411,33 @@ class EmulatedBackend(IBackend):
             self.served += 1
         if fault == "unplug_after":
             self._position += 1  # the scene goes on
-        self._queue.extend(_transfer(fault, data, due, self._splits, self._random))
-        self._splits += fault == "split"
+        self._queue.extend(self._transfer(fault, data, due))
+
+    def _transfer(self, fault: str | None, data: bytes, ready_s: float) -> list[_Chunk]:
+        """What comes over the wire for a frame, where under a fault something comes."""
+        whole = memoryview(data)
+        if fault == "overflow":
+            return [_Chunk(ready_s, error=errno.EOVERFLOW)]
+        if fault == "short":
+            return [_Chunk(ready_s, whole[:50_001], ends=True)]
+        if fault == "cut":
+            return [_Chunk(ready_s, whole[: 99 * _PACKET_BYTES])]
+        if fault == "empty":
+            return [_Chunk(ready_s, ends=True)]
+        if fault == "long":
+            return [_Chunk(ready_s, memoryview(data + b"\xa5" * 700), ends=True)]
+        if fault == "split":
+            self._splits = self._splits % (_PACKETS - 1) + 1
+            at = self._splits * _PACKET_BYTES
+            return [_Chunk(ready_s, whole[:at], ends=True), _Chunk(ready_s, whole[at:])]
+        if fault in ("unplug_during", "unplug_after"):
+            came = whole[: 50 * _PACKET_BYTES] if fault == "unplug_during" else whole
+            return [_Chunk(ready_s, came), _Chunk(ready_s, error=errno.ENODEV)]
+        if fault == "garbage":
+            whole = memoryview(self._random.bytes(FRAME_BYTES))
+        elif fault in ("zeros", "ones"):
+            whole = memoryview((b"\0" if fault == "zeros" else b"\xff") * FRAME_BYTES)
+        return [_Chunk(ready_s, whole)]
 
     def _next_frame(self) -> bytes | None:
         source = self._source
