@@ -145,12 +145,8 @@ def _as_packed(entry: zipfile.ZipInfo) -> zipfile.ZipInfo:
 def read_archive(
     path: str | Path, names: Collection[str] | None = None, most_bytes: int | None = None
 ) -> dict[str, np.ndarray]:
-    """All arrays of an .npz file by name, or those of some names that are there.
-
-    most_bytes: of all together; None = a gigabyte.
-    Raises FileNotFoundError; another OSError when it cannot be read; ValueError, saying in few
-    words why, when it is no .npz archive, is cut off or damaged, too large to be meant, or holds
-    pickled objects.
+    """All arrays of an .npz file by name, or those of some names that are there; raises as
+    `Archive`.  most_bytes: of all together; None = a gigabyte.
     """
     with open_to_read(path) as stream:
         archive = Archive(stream)
@@ -169,8 +165,7 @@ class Pieces:
 
 
 def write_archive(path: str | Path, arrays: Mapping[str, Any], level: int | None = None) -> None:
-    """Write an .npz file, compressed as `np.savez_compressed` does; it is there as a whole, or as
-    it was. Raises OSError.
+    """Write an .npz file, compressed as `np.savez_compressed` does, by `whole_file`.
 
     arrays: whatever numpy makes numbers or text of, or `Pieces`, by name.
     level: of the compression, 0 to 9; None = zlib's own, 6.

@@ -5,7 +5,8 @@ links, second names (hard links) of files elsewhere, pipes, devices. Nothing is 
 of them. A file becomes new under another name and then takes its place, so that what stood there is
 whole until then; only what must grow in place is opened in place, when it has no other name.
 
-A folder on the way to a file may be a link: which folder is meant, the user says.
+A folder on the way to a file may be a link: which folder is meant, the user says. What cannot be
+opened or written, or is of another kind, is an OSError.
 """
 
 from __future__ import annotations
@@ -51,10 +52,7 @@ class _NoFileError(OSError):
 
 
 def open_to_read(path: str | Path) -> BinaryIO:
-    """Open a file, also through a link; a pipe is never waited for.
-
-    Raises OSError: it cannot be opened, or is a folder, a pipe or a device.
-    """
+    """Open a file, also through a link; a pipe is refused, and never waited for."""
     _refuse(path, os.stat(path))  # before it is opened, which does something to some devices
     descriptor = os.open(path, os.O_RDONLY | _BINARY | _NO_WAIT)
     try:
@@ -78,12 +76,10 @@ def check_readable(path: str | Path) -> None:
 
 
 def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> BinaryIO:
-    """Make a file that grows from nothing, open for writing and reading.
+    """Make a file where nothing stands, open for writing and reading.
 
     replace: let a file that stands there go; its other names, if any, keep what is in it.
     buffered: False: what is written reaches the operating system at once; `write` may take a part.
-
-    Raises OSError: something stands there (`replace`: that is no file), or it cannot be made.
     """
     if replace:
         check_replaceable(path)
@@ -93,10 +89,8 @@ def open_new(path: str | Path, replace: bool = False, buffered: bool = True) -> 
 
 
 def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
-    """Open a file of ours to change it, without buffer; what is in it stays. Where there is none,
-    make an empty one.
-
-    Raises OSError: it is a link, has a second name, or is no file; or it cannot be opened.
+    """Open a file of ours to change it, no link and without a second name, without buffer; what is
+    in it stays. Where there is none, make an empty one.
     """
     flags = os.O_RDWR | (os.O_CREAT if make else 0) | _NO_LINK | _NO_WAIT | _BINARY
     if not _NO_LINK:  # Windows
@@ -120,8 +114,7 @@ def open_in_place(path: str | Path, make: bool = True) -> io.FileIO:
 
 def write_on(stream: IO[bytes] | RawIOBase, size: int, *parts: bytes) -> int:
     """Write bytes at the end of a file of that size, which has no buffer; returns its size then.
-
-    Raises OSError; the file is then as it was.
+    After an error the file is as it was.
     """
     try:
         for part in parts:
@@ -195,9 +188,8 @@ def _check_kept(path: str | Path) -> None:
 
 @contextmanager
 def whole_file(path: str | Path) -> Iterator[BinaryIO]:
-    """A stream, open for writing and reading; `path` changes when all of it is on the disk.
-
-    Raises OSError, after which, as after any other error, `path` is as it was.
+    """A stream, open for writing and reading; `path` changes when all of it is on the disk, and
+    after an error is as it was.
     """
     path = Path(path)
     check_replaceable(path)
@@ -218,7 +210,7 @@ def whole_file(path: str | Path) -> Iterator[BinaryIO]:
 
 
 def write_whole(path: str | Path, content: bytes | str) -> None:
-    """Write a file, text in UTF-8; it is there as a whole, or as it was. Raises OSError."""
+    """Write a file, text in UTF-8; it is there as a whole, or as it was."""
     with whole_file(path) as stream:
         stream.write(content.encode() if isinstance(content, str) else content)
 
@@ -233,9 +225,8 @@ def remove_partial(folder: Path, names: Collection[str]) -> None:
 
 
 def let_links_go(path: Path) -> None:
-    """Remove, under a name that another library will write, a link, a second name or a pipe.
-
-    What they lead to stays. Raises OSError.
+    """Remove, under a name that another library will write, a link, a second name or a pipe; what
+    they lead to stays.
     """
     with suppress(FileNotFoundError):
         status = os.lstat(path)
@@ -245,7 +236,7 @@ def let_links_go(path: Path) -> None:
 
 
 def make_folder(path: str | Path) -> None:
-    """Make a folder in one that may be somebody else's. Raises OSError, also where it is a link."""
+    """Make a folder in one that may be somebody else's; a link to one is refused."""
     if Path(path).is_symlink():
         raise OSError(errno.ELOOP, "it is a symbolic link; take it away", str(path))
     Path(path).mkdir(parents=True, exist_ok=True)

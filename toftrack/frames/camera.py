@@ -229,10 +229,7 @@ class Camera:
         return depth if radial else depth * self._ray_lengths
 
     def undistort_amplitude(self, amplitude: np.ndarray | None) -> np.ndarray | None:
-        """The (H, W) amplitude image on the grid of `rectify`, of the same type; None stays None.
-
-        Raises ToftrackError when the image is not of the camera's size.
-        """
+        """The (H, W) amplitude image on the grid of `rectify`, in its own type; None stays None."""
         if amplitude is None:
             return None
         self.check_size(amplitude)
@@ -284,10 +281,7 @@ class Camera:
 
     @classmethod
     def load_for(cls, path: str | Path, width: int, height: int, images: str) -> Camera:
-        """`load` a camera file for images of that size; `images` is what errors call them.
-
-        Raises ToftrackError as `load`, and when the camera is of another size.
-        """
+        """`load` a camera file for images of that size, which errors call `images`."""
         camera = cls.load(path)
         if (camera.width, camera.height) != (width, height):
             raise ToftrackError(

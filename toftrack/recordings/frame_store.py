@@ -19,7 +19,10 @@ DEFAULT_FPS = 25.0
 
 
 class FrameStore:
-    """T frames in an order, each to be had by its number."""
+    """T frames in an order, each to be had by its number. Opening one raises ToftrackError, one
+    sentence that names the file: it is missing, damaged or of another kind, or nothing tells its
+    camera.
+    """
 
     camera: Camera
     fps: float

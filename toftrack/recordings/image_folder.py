@@ -119,11 +119,7 @@ class ZippedFiles(Files):
 
 class ImageFolder(FrameStore):
     """The frames of a folder of depth images, or of a `.zip`, read from the disk one at a time: the
-    first image is checked when it is opened.
-
-    given: goes before what `camera.json` says; the unit is else 0.001 (of floats 1), fps 25. Raises
-    ToftrackError: there is no depth image or camera, `camera.json` makes no sense, or the first
-    image is damaged, or of another size than the camera's; later, another one.
+    first image is checked when it is opened.  given: goes before what `camera.json` says.
     """
 
     unit_m: float
@@ -280,8 +276,7 @@ def write_image_folder(
 
     folder: made when it does not exist; must hold nothing of such a folder.  unit_m: metres of one
     step, to which depth is rounded; no reading and what is too far become 0.  progress: called
-    after each frame. Raises ToftrackError: the folder cannot be written or is in use, or the store
-    not be read.
+    after each frame.
     """
     folder = Path(os.path.expanduser(folder))
     facts = {"depth_unit_m": unit_m, "radial": store.radial, "fps": store.fps}

@@ -131,11 +131,7 @@ class Recording(FrameStore):
 
 
 def read_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> Recording:
-    """Read and check a recording. ToftrackError, one sentence that names the file, when it is
-    missing, damaged, contains pickled objects or breaks the format above.
-
-    given: its camera, and its frame rate, where it says nothing of them.
-    """
+    """Read and check a recording; given: its camera and rate, where it says nothing of them."""
     path = file_of(path)
     try:
         with reading(path), open_to_read(path) as stream:
@@ -178,8 +174,7 @@ def write_recording(
     complete one.
 
     store: read twice where it has amplitudes. Depth keeps the type of a `Recording` (float16 or
-    float32), and becomes float32 of others.  progress: called after each frame's depth. Raises
-    ToftrackError: the file cannot be written, or the store not be read.
+    float32), and becomes float32 of others.  progress: called after each frame's depth.
     """
 
     def depth_images() -> Iterator[np.ndarray]:

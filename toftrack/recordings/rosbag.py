@@ -68,9 +68,7 @@ class RosBag(FrameStore):
 
     path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  given: a lens instead of the
     bag's camera_info; the topic of the depth images, None = the only one there is; metres of one
-    step of 16UC1, None = a millimetre, as ROS says. Raises ToftrackError: rosbags is not installed,
-    the bag is damaged, it has no depth images or several topics of them, or nothing tells their
-    lens; one sentence.
+    step of 16UC1, None = a millimetre, as ROS says.
     """
 
     unit_m: float

@@ -181,8 +181,7 @@ class SrsRecording(FrameStore):
     it is opened. One that is cut off or damaged somewhere is usable up to there (`damage` says so).
 
     modulation_mhz: tells the range of a recording that does not state it (the vendor's keep it in
-    registers whose meaning is not public). Raises ToftrackError: the file is missing, not a stream
-    file, of another version, in a wrong order or without any whole frame.
+    registers whose meaning is not public).
     """
 
     radial = True

@@ -46,8 +46,7 @@ class Stack(FrameStore):
     name.
 
     given: a lens, or camera.json lies beside the file; the unit of whole numbers (a millimetre) and
-    the frame rate (25); of a `.h5` or `.mat` that has several, the dataset. Raises ToftrackError:
-    it is no such stack, damaged, holds pickled objects, or nothing tells its camera.
+    the frame rate (25); of a `.h5` or `.mat` that has several, the dataset.
     """
 
     unit_m: float

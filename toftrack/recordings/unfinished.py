@@ -76,8 +76,7 @@ class _Kept:
 class GrowingFile:
     """A new file that grows by whole records; each is the operating system's when `write` returns.
 
-    replace: let a file that stands there go. Raises ToftrackError where another process writes the
-    file, and OSError where something stands there, or it cannot be made.
+    replace: let a file that stands there go. ToftrackError where another process writes that.
     """
 
     def __init__(self, path: Path, replace: bool) -> None:
@@ -98,9 +97,7 @@ class GrowingFile:
 
 
 class UnfinishedRecording(GrowingFile):
-    """A file that grows by frames. Raises as a `GrowingFile`, and OSError where it cannot be
-    written; then it ends with the frame before.
-    """
+    """A file that grows by frames."""
 
     def __init__(self, path: Path, replace: bool = False) -> None:
         self.path, self.frames = path, 0
@@ -163,9 +160,7 @@ def is_recording(path: Path) -> bool:
 
 def recover_recording(path: Path, overwrite: bool = False) -> tuple[Path, int]:
     """Finish what a recorder that was killed has left; returns the recording and its frames.
-
-    path: FILE.npz, or the FILE.npz.part beside it.  overwrite: replace FILE.npz. ToftrackError as
-    `finish`, and where there is nothing that was left.
+    path: FILE.npz, or the FILE.npz.part beside it.
     """
     part = path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
     if not os.path.lexists(part):

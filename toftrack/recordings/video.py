@@ -41,8 +41,7 @@ class DepthVideo(FrameStore):
     16 bits (FFV1).
 
     given: a lens, unit (a millimetre) and frame rate of a video that does not tell them; a lens
-    goes before a Kinect's own calibration. Raises ToftrackError: it is damaged, has colour images
-    or no depth, or nothing tells its camera.
+    goes before a Kinect's own calibration.
     """
 
     unit_m: float
