@@ -139,9 +139,7 @@ class Replay(BaseDevice):
 
 
 class Sample(Replay):
-    """A recording that comes with the package, with ground truth; as `Replay`. ToftrackError, which
-    lists them, for a name that no sample has.
-    """
+    """A recording that comes with the package, with ground truth; as `Replay`."""
 
     def __init__(self, name: str = FIRST_SAMPLE, **playback: Any) -> None:
         # Where the package happens to be installed says nothing about the result.

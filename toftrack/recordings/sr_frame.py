@@ -48,11 +48,8 @@ def nominal_camera() -> Camera:
 def decode_frame(
     data: bytes, range_m: float, amplitude_threshold: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The images of a raw frame of FRAME_BYTES bytes, new arrays: (144, 176) float32 metres along
-    each pixel's ray, 0 = no reading, and the (144, 176) uint16 amplitude.
-
-    range_m: what the largest distance word stands for.  amplitude_threshold: pixels of a smaller
-    amplitude become "no reading".
+    """The images of a raw frame, new arrays: (144, 176) float32 metres along each pixel's ray, 0 =
+    no reading, as of pixels below the threshold, and the (144, 176) uint16 amplitude.
     """
     words = np.frombuffer(data, _WORD).reshape(2, HEIGHT, WIDTH)
     radial = words[0].astype(np.float32) * np.float32(range_m / _LARGEST_WORD)
@@ -64,10 +61,7 @@ def decode_frame(
 
 def encode_frame(radial_m: np.ndarray, amplitude: np.ndarray | None, range_m: float) -> bytes:
     """The raw frame of two images; `decode_frame` gives them back, distances to range_m / 131070.
-
-    radial_m: (144, 176) metres along each pixel's ray; what is no number, not above 0 or beyond the
-    range becomes 0, "no reading".  amplitude: (144, 176) uint16; None gives zeros. ToftrackError
-    where an image is not of the camera's size.
+    What is no number or beyond the range becomes "no reading"; no amplitude gives zeros.
     """
     for image in (radial_m, amplitude):
         if image is not None and image.shape != (HEIGHT, WIDTH):

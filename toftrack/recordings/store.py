@@ -128,9 +128,7 @@ def open_sample(name: str = FIRST_SAMPLE) -> FrameStore:
 
 
 def sample_file(name: str) -> str:
-    """The file's name of a sample, in toftrack/data. Raises ToftrackError when there is none of
-    that name; it lists those that there are.
-    """
+    """The file's name of a sample, in toftrack/data; ToftrackError where there is none."""
     if name not in SAMPLES:
         near = difflib.get_close_matches(str(name), SAMPLES, 1)
         meant = f"; did you mean {near[0]}?" if near else ""

@@ -225,8 +225,7 @@ _ADVICE = "give a calibrated camera with camera.file=FILE"
 def _kinect_of(container: Any, path: Path) -> tuple[int | None, list[int], float, dict[str, Any]]:
     """What an Azure Kinect's recording says of itself: the numbers of its tracks of depth and of
     infrared (one or none); seconds of the camera's clock at the file's time 0; and facts for the
-    metadata, JSON-able. Of every other video there is none of that. Raises ToftrackError when it
-    was recorded without depth.
+    metadata, JSON-able. Of every other video there is none of that.
     """
     depth, infrared = _tracks(container, "DEPTH"), _tracks(container, "IR")
     if not depth:
@@ -245,9 +244,7 @@ def _kinect_of(container: Any, path: Path) -> tuple[int | None, list[int], float
 
 
 def _camera_of(container: Any, path: Path, width: int, height: int) -> Camera:
-    """The depth camera for images of that size, from the attached calibration. Raises ToftrackError
-    when that is missing, damaged, or of a kind that no shipped camera has.
-    """
+    """The depth camera for images of that size, from the attached calibration."""
     text = _attachment(container)
     if text is None:
         raise ToftrackError(f"'{path}' has no attachment {_CALIBRATION}; {_ADVICE}")

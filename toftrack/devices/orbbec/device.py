@@ -182,9 +182,8 @@ class Orbbec(SdkCamera):
 
 
 def load_sdk() -> ModuleType:
-    """The module pyorbbecsdk, silenced; ToftrackError when it is not installed or cannot be loaded.
-
-    It would write a log into the working directory, and greet on the standard output.
+    """The module pyorbbecsdk, silenced: it would write a log into the working directory, and greet
+    on the standard output. ToftrackError where there is none.
     """
     try:
         with _greeting_elsewhere():
@@ -226,9 +225,7 @@ def _size(profile: Any) -> tuple[int, int, int]:
 
 
 def _camera_of(ob: ModuleType, profile: Any) -> Camera:
-    """The depth camera of a stream, whose lens model the SDK shares with OpenCV; ToftrackError for
-    a lens that OpenCV does not have.
-    """
+    """The depth camera of a stream, whose lens model the SDK shares with OpenCV."""
     lens, distortion = profile.get_intrinsic(), profile.get_distortion()
     K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1.0]])
     width, height = profile.get_width(), profile.get_height()

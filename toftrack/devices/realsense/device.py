@@ -184,10 +184,7 @@ class RealSense(SdkCamera):
 
 
 def load_sdk(otherwise: str = "") -> ModuleType:
-    """The module pyrealsense2; ToftrackError when it is not installed or cannot be loaded.
-
-    otherwise: what else there is to do, for the error.
-    """
+    """The module pyrealsense2; ToftrackError, with what to do `otherwise`, where there is none."""
     try:
         return _imported()
     except ImportError as error:

@@ -44,8 +44,7 @@ class EmulatorSettings:
 class EmulatedCamera:
     """The software device; `start` it when the pipeline runs, `stop` it before that ends.
 
-    Depth images are rectified Z: the SDK's cameras know no correction of the depth. Raises
-    ToftrackError when the recording cannot be used.
+    Depth images are rectified Z: the SDK's cameras know no correction of the depth.
     """
 
     def __init__(self, rs: ModuleType, settings: EmulatorSettings) -> None:

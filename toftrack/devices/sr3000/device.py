@@ -47,9 +47,7 @@ class Sr3000(BaseDevice):
     iteration goes on with a gap in the frames' indices when it is back.
 
     The arguments are those of conf/device/sr3000.yaml; `fps` is the rate that is given to those who
-    must know one in advance, while the emulated camera has its own. Raises ToftrackError: a setting
-    makes no sense, there is no camera (or library), or the emulated camera's recording cannot be
-    used.
+    must know one in advance, while the emulated camera has its own.
     """
 
     def __init__(

@@ -44,9 +44,8 @@ _LARGEST_DRAIN = 8 * FRAME_BYTES
 
 
 class UsbTransport:
-    """Finds, claims, configures and reads one camera.
-
-    The camera is never reset: whether its firmware would survive that is not known.
+    """Finds, claims, configures and reads one camera, which is never reset: whether its firmware
+    would survive that is not known.
 
     exposure: written to the camera where the settings say to which registers.  serial: None = the
     only camera.  backend: of pyusb; None = libusb.
