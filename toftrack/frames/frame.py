@@ -133,20 +133,18 @@ class Truth:
 
     def __getitem__(self, rows: slice) -> Truth:
         """The truth of a range of frames, by their positions."""
-        return self._taken(rows, self.first + rows.indices(len(self))[0])
+        return self.of_frames(self.first + np.arange(len(self))[rows])
 
     def of_frames(self, numbers: np.ndarray) -> Truth:
         """The truth of the frames of these numbers (n,), in their order; IndexError for others."""
         rows = np.asarray(numbers) - self.first
         if len(rows) and rows.min() < 0:
             raise IndexError(f"there is no truth of frame {rows.min() + self.first}")
-        return self._taken(rows, int(numbers[0]) if len(rows) else self.first)
-
-    def _taken(self, rows: slice | np.ndarray, first: int) -> Truth:
         arrays: dict[str, Any] = {
             name: array[rows] for name, array in vars(self).items() if isinstance(array, np.ndarray)
         }
-        other = None if self.other is None else self.other._taken(rows, first)
+        first = int(numbers[0]) if len(rows) else self.first
+        other = None if self.other is None else self.other.of_frames(numbers)
         return replace(self, **arrays, first=first, other=other)
 
 
