@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from abc import abstractmethod
 from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from toftrack.frames.frame import Truth
 DEFAULT_FPS = 25.0
 
 
+@dataclass(eq=False, repr=False, kw_only=True)
 class FrameStore:
     """T frames in an order, each to be had by its number. Opening one raises ToftrackError, one
     sentence that names the file: it is missing, damaged or of another kind, or nothing tells its
@@ -28,7 +30,7 @@ class FrameStore:
     fps: float
     timestamp_s: np.ndarray
     """(T,) float64, not decreasing."""
-    metadata: dict[str, Any]
+    metadata: dict[str, Any] = field(default_factory=dict)
     radial: bool = False
     """True: the depth is the distance along each pixel's ray; False: Z along the axis."""
     truth: Truth | None = None

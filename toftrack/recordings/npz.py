@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -111,14 +111,8 @@ class Recording(FrameStore):
 
     depth: Images
     """(T, H, W) float16 or float32 metres."""
-    radial: bool
-    camera: Camera
-    timestamp_s: np.ndarray
-    fps: float
     amplitude: Images | None = None
     """(T, H, W) uint16."""
-    truth: Truth | None = None
-    metadata: dict[str, Any] = field(default_factory=dict)
 
     def image(self, index: int) -> tuple[np.ndarray, np.ndarray | None]:
         amplitude = None if self.amplitude is None else self.amplitude[index]
