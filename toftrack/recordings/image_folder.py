@@ -311,16 +311,13 @@ def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
     path = _beside(files, depth[0], _TIMES)
     if path is None:
         return None
-    what, remedy = f"'{path}' in {files.what} cannot be read", "it must be one number a line"
-    count = len(depth)
+    what, count = f"'{path}' in {files.what} cannot be used", len(depth)
+    remedy = f"it needs {count} finite times, one an image, never going back; repair or remove it"
     with reported_errors(what, remedy, ValueError):
         words = files.text(path).split(maxsplit=count)
         times = np.array([float(word) for word in words[:count]])
-    if len(words) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
-        raise ToftrackError(
-            f"'{path}' in {files.what} must hold {count} finite times, one for each depth image, "
-            "that do not go backwards; repair or remove it"
-        )
+        if len(words) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
+            raise ValueError("too few, too many, backwards or not finite")
     return times
 
 

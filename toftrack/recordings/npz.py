@@ -249,16 +249,14 @@ def _check_layout(shape: tuple[int, ...], arrays: dict[str, Any], key: str) -> N
 
 
 def _check_depth(depth: Images, key: str) -> Images:
-    if depth.ndim != 3:
+    if depth.ndim != 3 or 0 in depth.shape:
         raise ToftrackError(
-            f"'{key}' must have 3 dimensions (frames, rows, columns), but has {depth.ndim}, shape "
-            f"{depth.shape}"
+            f"'{key}' must have 3 dimensions (frames, rows, columns) and at least one frame of at "
+            f"least one pixel, but has the shape {depth.shape}"
         )
     whole = depth.dtype.kind in "iu"
     if not whole and depth.dtype.kind != "f":
         raise ToftrackError(f"'{key}' must be float32 or float16 metres, but is {depth.dtype}")
-    if 0 in depth.shape:
-        raise ToftrackError(f"'{key}' is empty, shape {depth.shape}; record at least one frame")
     some = some_images(depth)
     if whole or could_be_metres(some) is False:
         raise wrong_unit(f"'{key}'", some)
@@ -270,11 +268,10 @@ def _times(arrays: dict[str, Any], count: int, given: float | None) -> tuple[np.
     """Times and rate.  given: the rate of a file that says neither."""
     fps = None
     if "fps" in arrays:
-        if arrays["fps"].size != 1 or arrays["fps"].dtype.kind not in "iuf":
-            raise ToftrackError("'fps' must be one number")
-        fps = float(arrays["fps"].reshape(()))
-        if not (np.isfinite(fps) and fps > 0):
-            raise ToftrackError(f"'fps' must be a positive number, but is {fps:g}")
+        rate = arrays["fps"]
+        fps = float(rate.reshape(())) if rate.size == 1 and rate.dtype.kind in "iuf" else 0.0
+        if not 0 < fps < np.inf:
+            raise ToftrackError(f"'fps' must be one positive number, but is {rate}")
     if "timestamp_s" not in arrays:
         fps = fps or given or DEFAULT_FPS
         return np.arange(count) / fps, fps

@@ -233,16 +233,11 @@ class SrsRecording(FrameStore):
     def _scan(self, stream: BinaryIO, size: int) -> None:
         """Walk over the objects; ToftrackError where they break the format."""
         header = stream.read(_PAIR.size)
-        if len(header) < _PAIR.size:
-            raise ToftrackError(
-                f"the file '{self.path}' is empty or cut off within its first bytes; record it "
-                "again"
-            )
-        signature, version = _PAIR.unpack(header)
+        signature, version = _PAIR.unpack(header.ljust(_PAIR.size, b"\0"))
         if signature != _SIGNATURE:
             raise ToftrackError(
-                f"'{self.path}' is not an .srs stream file: it does not begin with 'srIO'; give a "
-                "recording as the vendor's or toftrack's recorder writes it"
+                f"'{self.path}' is empty or not an .srs stream file: it does not begin with 'srIO';"
+                " give a recording as the vendor's or toftrack's recorder writes it"
             )
         if version != _VERSION:
             raise ToftrackError(
