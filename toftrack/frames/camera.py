@@ -337,10 +337,11 @@ class Camera:
     def _undistort(self, image: np.ndarray) -> np.ndarray:
         return cv2.remap(image, self._undistortion_map, None, cv2.INTER_NEAREST, borderValue=0)
 
-    def check_size(self, image: np.ndarray) -> None:
+    def check_size(self, image: np.ndarray, what: str = "the image") -> None:
         """Raise ToftrackError where an image has not the camera's rows and columns."""
         if image.shape != (self.height, self.width):
+            size = "x".join(map(str, image.shape[::-1]))
             raise ToftrackError(
-                f"the image has the shape {image.shape}, but the camera has {self.height} rows and "
-                f"{self.width} columns; give the camera that took the images"
+                f"{what} has {size} pixels, but its camera {self.width}x{self.height}, in "
+                f"{self.height} rows; give the camera that took the images (camera.file=FILE)"
             )

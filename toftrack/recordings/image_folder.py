@@ -237,7 +237,8 @@ def _camera(
             content = parse_json(files.text(found))
         if not isinstance(content, dict):
             raise ToftrackError(f"'{found}' in {files.what} is not a camera file")
-    if lens := given.camera(width, height, f"the image '{image}' in {files.what}"):
+    what = f"the image '{image}' in {files.what}"
+    if lens := given.camera(width, height, what):
         return lens, content
     if not found:
         raise ToftrackError(
@@ -246,11 +247,7 @@ def _camera(
             "FILE), or the lens with device.intrinsics=[FX,FY,CX,CY] (--intrinsics FX FY CX CY)"
         )
     camera = Camera.from_dict(content, files.path / found)
-    if (width, height) != (camera.width, camera.height):
-        raise ToftrackError(
-            f"the image '{image}' in {files.what} has {width}x{height} pixels, but the camera "
-            f"has {camera.width}x{camera.height}; give the camera of these images"
-        )
+    camera.check_size(first, what)
     return camera, content
 
 

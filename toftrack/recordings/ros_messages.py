@@ -75,14 +75,10 @@ def _decompressed(message: Any) -> np.ndarray:
     if "rvl" in words.partition(";")[2]:
         depth = decoded_rvl(data[_HEADER.size :].tobytes())
         return _from_inverse(depth, data.tobytes()) if words.startswith("32FC1") else depth
-    start = data[: _HEADER.size + len(SIGNATURE)].tobytes().find(SIGNATURE)
-    if start not in (0, _HEADER.size):
-        raise ToftrackError(
-            f"it says '{words}', but holds no PNG; it is damaged or of another kind"
-        )
+    start = 0 if data[: len(SIGNATURE)].tobytes() == SIGNATURE else _HEADER.size
     image = decoded_png(data[start:].tobytes())
     if image is None or image.ndim != 2 or image.dtype != np.uint16:
-        raise ToftrackError("its PNG is damaged, or not of 16 bits and one channel")
+        raise ToftrackError(f"its PNG ('{words}') is damaged, or not of 16 bits and one channel")
     if not words.startswith("32FC1"):
         return image
     if start == 0:

@@ -89,11 +89,7 @@ class RosBag(FrameStore):
             check_metres(first, what, _OTHER_UNIT)
             height, width = first.shape
             self.camera = given.camera(width, height, what) or _camera(bag, topic)
-            if first.shape != (self.camera.height, self.camera.width):
-                raise ToftrackError(  # its lens would take that much memory
-                    f"{what} has {width}x{height} pixels, but its camera {self.camera.width}x"
-                    f"{self.camera.height}; give the right one with camera.file=FILE"
-                )
+            self.camera.check_size(first, what)  # its lens would take that much memory
             self.timestamp_s, self._recorded_ns, self.damage = _times(bag, topic)
         self.fps = rate_of(self.timestamp_s)
         self.metadata = {"topic": topic.name, "encoding": topic.encoding}
@@ -106,11 +102,7 @@ class RosBag(FrameStore):
             raise ToftrackError(f"'{self.path}' ended while it was read; is it still being copied?")
         self._next = index + 1
         depth = self._metres(message, index)
-        if depth.shape != (self.camera.height, self.camera.width):
-            raise ToftrackError(
-                f"frame {index} of '{self.path}' has {depth.shape[1]}x{depth.shape[0]} pixels, but "
-                f"its camera {self.camera.width}x{self.camera.height}; record images of one size"
-            )
+        self.camera.check_size(depth, f"frame {index} of '{self.path}'")
         return depth, None
 
     def close(self) -> None:
