@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import closing
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -107,7 +108,7 @@ def _sample_rays() -> np.ndarray:
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A board from 0.33 to 1.5 m, with noise and a depth error; nothing is said of the camera."""
     path, rng = tmp_path_factory.mktemp("calibration") / "board.srs", np.random.default_rng(0)
-    with SrsWriter(path, facts=SrsFacts(RANGE_M)) as writer:
+    with closing(SrsWriter(path, facts=SrsFacts(RANGE_M))) as writer:
         for number, pose in enumerate(board_poses(24, 0.33, 1.5)):
             images = render_board(pose, rng)
             writer.append(encode_frame(*images, RANGE_M), number / 25)

@@ -166,7 +166,7 @@ def _recordings(folder: Path) -> list[Reader]:
     srs = _new(folder, "srs") / "recording.srs"
     range_m = 7.5
     shape = (nominal_camera().height, nominal_camera().width)
-    with SrsWriter(srs) as writer:
+    with closing(SrsWriter(srs)) as writer:
         for time in times[:2]:
             writer.append(encode_frame(np.full(shape, 0.8, np.float32), None, range_m), float(time))
     png = folder / "png"

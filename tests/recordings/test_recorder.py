@@ -7,6 +7,7 @@ import shutil
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -57,7 +58,7 @@ def recorded(
     path: Path, *frames: Frame, limit_gb: float = 1.0, overwrite: bool = False
 ) -> Recorder:
     device = Images()
-    with Recorder(path, device, limit_gb, overwrite) as recorder:
+    with closing(Recorder(path, device, limit_gb, overwrite)) as recorder:
         for frame in frames or device:
             recorder.put(frame, wait=True)
     return recorder
@@ -81,7 +82,7 @@ CAMERAS = {
 def test_a_recording_holds_exactly_what_came(tmp_path: Path, lens: str) -> None:
     radial = lens in ("plain", "calibrated")
     device, path = Images(CAMERAS[lens], radial), tmp_path / "hand.npz"
-    with Recorder(path, device, 1.0) as recorder:
+    with closing(Recorder(path, device, 1.0)) as recorder:
         for frame in device:
             recorder.put(frame, wait=True)
             frame.depth[:] = 7  # a camera that uses its memory again
@@ -165,7 +166,7 @@ def test_what_is_no_unfinished_recording_is_reported(
 
 def test_a_recording_that_goes_on_is_not_recovered(tmp_path: Path) -> None:
     pytest.importorskip("fcntl")
-    with Recorder(tmp_path / "hand.npz", Images(), 1.0):
+    with closing(Recorder(tmp_path / "hand.npz", Images(), 1.0)):
         with pytest.raises(ToftrackError, match="being recorded just now"):
             recover_recording(tmp_path / "hand.npz")
         with pytest.raises(ToftrackError, match="being recorded just now"):
@@ -243,7 +244,7 @@ def test_what_is_removed_while_it_grows_is_one_sentence_and_nobody_waits(
 ) -> None:
     path = tmp_path / folder / "hand.npz"
     path.parent.mkdir(exist_ok=True)
-    with Recorder(path, Images(), 1.0) as recorder:
+    with closing(Recorder(path, Images(), 1.0)) as recorder:
         recorder.put(one_frame(), wait=True)
         while not recorder.frames:
             time.sleep(0.001)
@@ -292,7 +293,7 @@ def test_frames_that_do_not_fit_those_before_end_it(tmp_path: Path) -> None:
 
 
 def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "hand.npz", Images(), 1.0) as recorder:
+    with closing(Recorder(tmp_path / "hand.npz", Images(), 1.0)) as recorder:
         pass
     assert recorder.ended is None and recorder.words() == ""
     assert not list(tmp_path.iterdir())
@@ -319,7 +320,7 @@ def test_a_live_run_does_not_wait_for_the_disk(
 
     monkeypatch.setattr(module.UnfinishedRecording, "append", slow)
     many = 2 * waiting
-    with Recorder(tmp_path / "hand.npz", Images(), 1.0) as recorder:
+    with closing(Recorder(tmp_path / "hand.npz", Images(), 1.0)) as recorder:
         for _ in range(many):
             recorder.put(one_frame(), wait=False)
         held.set()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +33,7 @@ def raw_frames(count: int = FRAMES) -> list[bytes]:
 def record(path: Path, count: int = FRAMES) -> list[bytes]:
     frames = raw_frames(count)
     facts = SrsFacts(RANGE_M, Camera(np.diag((210.0, 211, 1)), WIDTH, HEIGHT), 50.0, {"who": "me"})
-    with SrsWriter(path, SrsInit(0x74, 2, 77), bytes(range(64)), facts) as writer:
+    with closing(SrsWriter(path, SrsInit(0x74, 2, 77), bytes(range(64)), facts)) as writer:
         for index, frame in enumerate(frames):
             writer.append(frame, 100 + 0.04 * index)
     return frames
@@ -151,7 +152,7 @@ def test_broken_files_are_reported(path: Path, content: bytes, words: str) -> No
 
 def test_a_recording_that_grows_is_not_taken_away_by_another(path: Path) -> None:
     pytest.importorskip("fcntl")
-    with SrsWriter(path) as writer:
+    with closing(SrsWriter(path)) as writer:
         writer.append(raw_frames(1)[0], 0.0)
         assert len(SrsRecording(path)) == 1, "each frame is on the disk when it was appended"
         with pytest.raises(ToftrackError, match="being recorded just now"):

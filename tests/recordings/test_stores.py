@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def of_npz(folder: Path, words: np.ndarray, save: Callable = np.savez) -> Path:
 
 
 def of_srs(folder: Path, words: np.ndarray) -> Path:
-    with SrsWriter(folder / "a.srs") as writer:
+    with closing(SrsWriter(folder / "a.srs")) as writer:
         for number, image in enumerate(words[:, :HEIGHT, :WIDTH]):
             frame = encode_frame(metres(image), image[::-1], RANGE_M)
             writer.append(frame, number / 25)

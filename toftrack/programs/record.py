@@ -13,6 +13,7 @@ import math
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from types import FrameType
 
@@ -134,7 +135,7 @@ def _record_raw(device: Sr3000, options: argparse.Namespace) -> None:
 
     about = SrsFacts(device.exposure.range_m, device.camera, device.fps, device.metadata)
     with (
-        SrsWriter(options.out, init, bytes(registers), about, options.overwrite) as writer,
+        closing(SrsWriter(options.out, init, bytes(registers), about, options.overwrite)) as writer,
         shutdown.handled(stop),
         _progress(options.frames) as bar,
     ):

@@ -8,7 +8,7 @@ import platform
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -69,7 +69,7 @@ def prepared_run(config: DictConfig, device: Device) -> Iterator[Run]:
     recording: AbstractContextManager[Recorder | None] = nullcontext()
     if config.get("record") is not None:  # a configuration of one's own may do without
         limit_gb = config.record_limit_gb
-        recording = Recorder(str(config.record), device, limit_gb, tell=_log.warning)
+        recording = closing(Recorder(str(config.record), device, limit_gb, tell=_log.warning))
     # Both tell at once what is wrong with them.
     with recording as recorder, instantiate(config.stream) as stream:
         tracker = build_hands_tracker(config)

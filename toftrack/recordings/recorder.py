@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Protocol, Self
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class Source(Protocol):
 
 
 class Recorder:
-    """Writes frames in a thread of its own; use it with `with`.
+    """Writes frames in a thread of its own, until `close`.
 
     They grow in `FILE.npz.part`, of which `FILE.npz` is made when the recorder is closed or takes
     no more; after a kill `toftrack recover FILE.npz` makes it. A recorder that cannot go on says
@@ -114,12 +114,6 @@ class Recorder:
         """What became of it, once it is closed; "" where there is none."""
         missed = f", {self.missed} more came too fast" if self.missed else ""
         return f"{self.path}: {self.frames} frames{missed}" if self._made else ""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _open(self) -> UnfinishedRecording:
         if self.path.suffix.lower() != ".npz":

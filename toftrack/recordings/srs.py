@@ -22,7 +22,7 @@ import os
 import struct
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, Self
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def srs_frame(data: bytes, timestamp_s: float) -> bytes:
 
 
 class SrsWriter(GrowingFile):
-    """Appends frames to a new `.srs` file; use it with `with`.
+    """Appends frames to a new `.srs` file, until `close`.
 
     Each frame reaches the operating system before `append` returns, so that a killed program leaves
     a file that is readable to its last whole frame.
@@ -162,12 +162,6 @@ class SrsWriter(GrowingFile):
         super().close()
         if not self.frames:
             self.path.unlink(missing_ok=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _write(self, content: bytes) -> None:
         what = f"the recording '{self.path}' cannot be written any further"
