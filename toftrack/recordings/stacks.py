@@ -218,14 +218,10 @@ class _Hdf5:
         self._file = self._latest = None
 
 
-def _hdf5(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
-    return _Hdf5(path, wanted), _REVERSED if path.suffix.lower() == ".mat" else _PYTHONS
-
-
 def _mat(path: Path, wanted: str | None) -> tuple[Any, tuple[int, ...]]:
     with reading(path), open_to_read(path) as stream:
         if stream.read(10) == b"MATLAB 7.3":
-            return _hdf5(path, wanted)
+            return _Hdf5(path, wanted), _REVERSED
     with _reported(path):
         variables = matlab_variables(path)
         there = {
@@ -248,8 +244,8 @@ _OPENED = {
     ".npy": _npy,
     ".tif": lambda path, _: (_Tiff(path), _PYTHONS),
     ".tiff": lambda path, _: (_Tiff(path), _PYTHONS),
-    ".h5": _hdf5,
-    ".hdf5": _hdf5,
+    ".h5": lambda path, wanted: (_Hdf5(path, wanted), _PYTHONS),
+    ".hdf5": lambda path, wanted: (_Hdf5(path, wanted), _PYTHONS),
     ".mat": _mat,
 }
 DATASETS = (".h5", ".hdf5", ".mat")

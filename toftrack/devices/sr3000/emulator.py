@@ -132,7 +132,6 @@ class _Id:
 class _Handle:
     device: _Id
     claimed: bool = False
-    closed: bool = False
 
 
 class _Descriptor:
@@ -243,11 +242,11 @@ class EmulatedBackend(IBackend):
 
     def close_device(self, handle: _Handle) -> None:
         with self._lock:
-            if handle.closed:
+            if handle not in self.open_handles:
                 self.misuse.append("a handle was closed twice")
             if handle.claimed and handle.device.plugging == self._plugging:
                 self.misuse.append("a handle was closed with its interface claimed")
-            handle.closed, handle.claimed = True, False
+            handle.claimed = False
             self.open_handles.discard(handle)
 
     def get_configuration(self, handle: _Handle) -> int:
@@ -350,7 +349,7 @@ class EmulatedBackend(IBackend):
             raise _error(errno.ENODEV)
 
     def _check(self, handle: _Handle, claimed: bool = True) -> None:
-        if handle.closed:
+        if handle not in self.open_handles:
             self.misuse.append("a closed handle was used")
             raise _error(errno.EINVAL)
         self._check_plugged(handle.device)
