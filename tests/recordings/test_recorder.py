@@ -215,7 +215,7 @@ def test_at_its_limit_and_before_the_disk_is_full_it_ends_as_a_whole_file(
 ) -> None:
     usage = SimpleNamespace(free=module._SPARE_BYTES + free)
     fake = SimpleNamespace(disk_usage=lambda path: usage)
-    monkeypatch.setattr("toftrack.recordings.unfinished.shutil", fake)
+    monkeypatch.setattr("toftrack.recordings.recorder.shutil", fake)
     recorder = recorded(tmp_path / "hand.npz", limit_gb=limit_gb)
     assert 1 <= recorder.frames < FRAMES and not recorder.failed
     assert why in (recorder.ended or "")

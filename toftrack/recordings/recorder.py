@@ -6,6 +6,7 @@ import json
 import math
 import os
 import queue
+import shutil
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -141,14 +142,14 @@ class Recorder:
     def _take(self, frame: Frame) -> None:
         try:
             self._write(frame)
-            space = self._file.has_space(_SPARE_BYTES)
+            free = shutil.disk_usage(self.path.parent).free - self._file.bytes  # of the `.npz`, too
         except Exception as error:  # of whatever kind, nobody is to wait for this thread
             reason = getattr(error, "strerror", None) or str(error) or type(error).__name__
             self._end(reason, failed=True)
         else:
             if self._file.bytes >= self._limit_gb * _GIGABYTE:
                 self._end(f"it reached its limit, {self._limit_gb:g} GB", failed=False)
-            elif not space:
+            elif free <= _SPARE_BYTES:
                 self._end("the disk is nearly full", failed=False)
 
     def _write(self, frame: Frame) -> None:

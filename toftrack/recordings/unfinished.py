@@ -13,7 +13,6 @@ import io
 import json
 import math
 import os
-import shutil
 import struct
 import zipfile
 import zlib
@@ -122,10 +121,6 @@ class UnfinishedRecording(GrowingFile):
             check = zlib.crc32(part, check)
         self.write(head, *pieces, _CHECK.pack(check))
         self._sums, self.frames = sums, self.frames + 1
-
-    def has_space(self, spare_bytes: int) -> bool:
-        """Whether the disk would take the `.npz`, too, and leave so much to others."""
-        return shutil.disk_usage(self.path.parent).free > self.bytes + spare_bytes
 
 
 def finish(part: Path, path: Path, overwrite: bool = False) -> int:
