@@ -6,7 +6,7 @@ docs/formats.md says what each key holds.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ class StreamedImages:
                 "array must be numbers in C order: save it with numpy.ascontiguousarray"
             )
         self.shape, self.dtype, self.ndim = header.shape, header.kind, len(header.shape)
-        self._images: Generator[np.ndarray] | None = None
+        self._images: Iterator[tuple[int, np.ndarray]] = iter(())
         self._latest: tuple[int, np.ndarray] | None = None
 
     def __len__(self) -> int:
@@ -70,21 +70,15 @@ class StreamedImages:
         if not 0 <= index < len(self):
             raise IndexError(index)
         if self._latest is None or index < self._latest[0]:
-            self.close()
-            self._images = self._in_turn()
-        number, image = self._latest or (-1, np.empty(0))
-        while number < index:
-            assert self._images is not None
-            number, image = number + 1, next(self._images)
-            self._latest = number, image
-        return image
+            self._images, self._latest = enumerate(self._in_turn()), None
+        while self._latest is None or self._latest[0] < index:
+            self._latest = next(self._images)
+        return self._latest[1]
 
     def close(self) -> None:
-        if self._images is not None:
-            self._images.close()
-        self._images = self._latest = None
+        self._images, self._latest = iter(()), None
 
-    def _in_turn(self) -> Generator[np.ndarray]:
+    def _in_turn(self) -> Iterator[np.ndarray]:
         shape = self.shape[1:]
         size = int(np.prod(shape)) * self.dtype.itemsize
         recording, remedy = f"the recording '{self._path}'", "copy or record it again"
