@@ -127,7 +127,7 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Plug) -> None:
         orbbec()
     assert orbbec(serial=42).description["serial"] == "0042"
     assert orbbec(serial="CL77").description["serial"] == "CL77"
-    with pytest.raises(ToftrackError, match="serial number 5; there is 0042, CL77"):
+    with pytest.raises(ToftrackError, match="serial number 5; .* 0042, CL77"):
         orbbec(serial=5)
 
 

@@ -61,16 +61,13 @@ def chosen_serial(
             "Linux its udev rules must be installed; or replay a recording with device.bag=FILE"
             + otherwise
         )
-    if serial is None and len(numbers) > 1:
-        raise ToftrackError(
-            f"there are {len(numbers)} {maker} cameras; set device.serial to one of {listed}"
-        )
-    for number in numbers:
-        # A number on the command line loses its zeros.
-        if serial is None or number.lstrip("0") == str(serial).lstrip("0"):
-            return number
+    # A number on the command line loses its zeros.
+    meant = [n for n in numbers if serial is None or n.lstrip("0") == str(serial).lstrip("0")]
+    if len(meant) == 1:
+        return meant[0]
+    those = "" if serial is None else f" with the serial number {serial}"
     raise ToftrackError(
-        f"there is no {maker} camera with the serial number {serial}; there is {listed}"
+        f"there are {len(meant)} {maker} cameras{those}; set device.serial to one of {listed}"
     )
 
 
