@@ -30,7 +30,8 @@ def tracked(
 def equal(one: object, two: object) -> bool:
     """Parts of a state, or estimates, to the last bit."""
     if isinstance(one, torch.Tensor | np.ndarray):
-        return np.array_equal(np.asarray(one), np.asarray(two), equal_nan=True)
+        one, two = np.asarray(one), np.asarray(two)
+        return np.array_equal(one, two, equal_nan=one.dtype.names is None)
     if isinstance(one, tuple) and isinstance(two, tuple):
         return len(one) == len(two) and all(map(equal, one, two))
     if is_dataclass(one):

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -67,6 +67,20 @@ _BEFORE = np.array([-1, *(4 * finger + joint for finger in range(5) for joint in
 _FIRST = np.array([4 * finger + bone for finger in range(5) for bone in SLOT_BONES])[_SLOTS]
 _JOINT_MOVES = (_BEFORE[:, None] // 4 == _FIRST // 4) & (_BEFORE[:, None] > _FIRST)
 """(21, 21) which angles move each joint: those that turn a bone of its finger before it."""
+_KEY = np.dtype(
+    [
+        ("angles", "f8", 21),
+        ("rotation", "f8", (3, 3)),
+        ("frames", "f8"),
+        ("weight", "f8"),
+        ("square", "f8"),
+        ("information", "f8", (_COUNT, _COUNT)),
+        ("vector", "f8", _COUNT),
+    ]
+)
+"""What a key pose said of the hand. angles: rad.  frames, weight, square: how many frames it has,
+sums of their weights and of the squares.  information, vector: their evidence by its weight's
+square: precision, and precision times the components."""
 _LEAST = 0.02
 """Weight below which a frame says nothing."""
 _STEP, _STEP_SIGMAS = 0.01, 0.5
@@ -89,54 +103,11 @@ class SeenHand(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class KeyPoses:
-    """What M different poses said of the hand; all on the CPU.
-
-    angles: (M, 21) rad.  rotations: (M, 3, 3).
-    frames, weight, square: (M,) how many frames each has, sums of their weights and of the squares.
-    information: (M, 6, 6), vector: (M, 6), the frames' evidence by its weight's square: precision,
-    and precision times the components.
-    """
-
-    angles: np.ndarray
-    rotations: np.ndarray
-    frames: np.ndarray
-    weight: np.ndarray
-    square: np.ndarray
-    information: np.ndarray
-    vector: np.ndarray
-
-    def nearest(self, state: Tensor) -> tuple[int, float]:
-        """The most similar key pose to a hand (1, 27), and how far it is, 1 where they differ."""
-        if not len(self.weight):
-            return -1, math.inf
-        angles, rotation = state[0, 6:].numpy(), rotation_matrix(state[0, 3:6].numpy())
-        bent = np.sqrt(np.square(self.angles - angles).mean(1)) / _KEY_RAD
-        cosine = 0.5 * ((self.rotations * rotation).sum((1, 2)) - 1)
-        far = np.hypot(bent, np.arccos(cosine.clip(-1, 1)) / _KEY_TURN_RAD)
-        row = int(far.argmin())
-        return row, float(far[row])
-
-    def considered(self, row: int, weight: float) -> bool:
-        """Whether a key pose has said enough for a frame of this weight to add little."""
-        total, frames = float(self.weight[row]), float(self.frames[row])
-        often = frames >= _ENOUGH_FRAMES and weight < _SURER * total / frames
-        return total > _ENOUGH or often
-
-    def summed(self) -> tuple[float, np.ndarray, np.ndarray]:
-        """How many sure poses this amounts to, and their evidence (6, 6) and (6,)."""
-        each = np.maximum(self.weight, 1e-9)
-        information = (self.information / each[:, None, None]).sum(0)
-        vector = (self.vector / each[:, None]).sum(0)
-        return float((self.square / each).sum()), information, vector
-
-
-@dataclass(frozen=True, eq=False)
 class ShapeEstimate:
     """What is believed of the user's hand.
 
     mean, covariance: (6,) and (6, 6) of the components.  poses: how many sure, different poses it
-    rests on.  keys: what they said.
+    rests on.  keys: (M,) of _KEY, what they said.
     applied: the components of the hand in use, which follows the mean in steps.
     off, considered: by how much the network's log length has differed from the mean lately, summed
     by weight, and the sum of these weights.
@@ -145,7 +116,7 @@ class ShapeEstimate:
 
     mean: np.ndarray
     covariance: np.ndarray
-    keys: KeyPoses
+    keys: np.ndarray
     applied: tuple[float, ...]
     poses: float = 0.0
     off: float = 0.0
@@ -167,11 +138,8 @@ class ShapeEstimate:
 
 def first_shape() -> ShapeEstimate:
     """Before any frame was seen: the population."""
-    none, square = np.zeros(0), (0, _COUNT, _COUNT)
-    angles, rotations, vector = np.zeros((0, 21)), np.zeros((0, 3, 3)), np.zeros((0, _COUNT))
-    keys = KeyPoses(angles, rotations, none, none, none, np.zeros(square), vector)
     population = np.diag(np.square(POPULATION_SIGMA))
-    return ShapeEstimate(np.zeros(_COUNT), population, keys, (0.0,) * _COUNT)
+    return ShapeEstimate(np.zeros(_COUNT), population, np.zeros(0, _KEY), (0.0,) * _COUNT)
 
 
 def with_network_length(
@@ -238,13 +206,14 @@ def learned(
     if weight < _LEAST:
         return estimate
     keys = estimate.keys
-    row, far = keys.nearest(state)
-    known = far <= 1
-    if known and keys.considered(row, weight):
+    angles, rotation = state[0, 6:].numpy(), rotation_matrix(state[0, 3:6].numpy())
+    row, known = _nearest(keys, angles, rotation)
+    if known and _considered(keys[row], weight):
         return estimate
-    if not known and len(keys.weight) == _KEYS:
-        row = int((keys.square / keys.weight).argmin())
-        if float(keys.square[row] / keys.weight[row]) >= weight:
+    if not known and len(keys) == _KEYS:
+        sure = keys["square"] / keys["weight"]
+        row = int(sure.argmin())
+        if sure[row] >= weight:
             return estimate
     information, vector = keypoints_system(posed(state), shape, derivatives, keypoints)
     reported_here = np.subtract(estimate.applied, KEYPOINTS_OFF)
@@ -254,8 +223,37 @@ def learned(
     precision = 0.5 / _LENGTH_SIGMA**2
     information[0, 0] += precision
     vector[0] += precision * math.log(detection.length_m / first.hand_length_m)
-    keys = _kept(keys, row, known, state, weight, information, vector)
+    square = weight**2
+    evidence = 1.0, weight, square, square * information, square * vector
+    new = np.array((angles, rotation, *evidence), _KEY)
+    if not known and len(keys) < _KEYS:
+        return _posterior(replace(estimate, keys=np.append(keys, new)))
+    keys = keys.copy()
+    if known:  # its pose stays that of its first frame
+        for name in ("frames", "weight", "square", "information", "vector"):
+            keys[name][row] += new[name]
+    else:
+        keys[row] = new
     return _posterior(replace(estimate, keys=keys))
+
+
+def _nearest(keys: np.ndarray, angles: np.ndarray, rotation: np.ndarray) -> tuple[int, bool]:
+    """The key pose that is most similar to a hand, -1 where there is none; and whether the hand is
+    in that pose.
+    """
+    if not len(keys):
+        return -1, False
+    bent = np.sqrt(np.square(keys["angles"] - angles).mean(1)) / _KEY_RAD
+    cosine = 0.5 * ((keys["rotation"] * rotation).sum((1, 2)) - 1)
+    far = np.hypot(bent, np.arccos(cosine.clip(-1, 1)) / _KEY_TURN_RAD)
+    row = int(far.argmin())
+    return row, bool(far[row] <= 1)
+
+
+def _considered(key: np.void, weight: float) -> bool:
+    """Whether a key pose has said enough for a frame of this weight to add little."""
+    often = key["frames"] >= _ENOUGH_FRAMES and weight < _SURER * key["weight"] / key["frames"]
+    return bool(key["weight"] > _ENOUGH or often)
 
 
 def keypoints_system(
@@ -318,40 +316,13 @@ def _joint_derivatives(frames: np.ndarray, base: np.ndarray, bones: np.ndarray) 
     return joints.reshape(_COUNT, 63).T
 
 
-def _kept(
-    keys: KeyPoses,
-    row: int,
-    known: bool,
-    state: Tensor,
-    weight: float,
-    information: np.ndarray,
-    vector: np.ndarray,
-) -> KeyPoses:
-    """The key poses with one more frame, which belongs to one of them or takes a row's place."""
-    new = (
-        state[0, 6:].numpy(),
-        rotation_matrix(state[0, 3:6].numpy()),
-        np.array(1.0),
-        np.array(weight),
-        np.array(weight**2),
-        weight**2 * information,
-        weight**2 * vector,
-    )
-    old = [getattr(keys, field.name) for field in fields(keys)]
-    if not known and len(keys.weight) < _KEYS:
-        return KeyPoses(*(np.concatenate((a, b[None])) for a, b in zip(old, new, strict=True)))
-    kept = [a.copy() for a in old]
-    for place, (field, value) in enumerate(zip(kept, new, strict=True)):
-        if not known:
-            field[row] = value
-        elif place > 1:  # the pose of a key stays that of its first frame
-            field[row] += value
-    return KeyPoses(*kept)
-
-
 def _posterior(estimate: ShapeEstimate) -> ShapeEstimate:
     """Mean, covariance and the hand in use by the key poses that there are."""
-    poses, information, vector = estimate.keys.summed()
+    keys = estimate.keys
+    each = np.maximum(keys["weight"], 1e-9)
+    poses = float((keys["square"] / each).sum())  # sure ones that all of them amount to
+    information = (keys["information"] / each[:, None, None]).sum(0)
+    vector = (keys["vector"] / each[:, None]).sum(0)
     shared = 1 / (1 + _ALIKE * max(poses - 1, 0.0))
     precision = np.diag(np.square(POPULATION_SIGMA) ** -1) + shared * information
     covariance = np.linalg.inv(precision)
