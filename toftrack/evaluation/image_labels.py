@@ -54,12 +54,14 @@ _FLAGS = ("visible", "guessed", "absent")
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Labels of points.  frames: by its number, (u, v) of each of the 21 joints that is visible."""
+    """Labels of points.  frames: by its number, (u, v) of each of the 21 joints that is visible.
+    content: as it stands in the file."""
 
     path: Path
     size: tuple[int, int]
     side: str
     frames: dict[int, dict[int, tuple[float, float]]]
+    content: dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,18 +76,13 @@ class Stills:
     called: dict[str, tuple[str, ...]]
 
 
-def read_labels(path: str | Path) -> Points | Stills:
-    """Labels of either kind; ToftrackError, one sentence that names the file."""
+def read_labels(path: str | Path, begun: bool = False) -> Points | Stills:
+    """Labels of either kind; where they are only `begun`, of points none need be visible yet.
+    Raises ToftrackError, one sentence that names the file."""
     path = Path(path).expanduser()
-    what = f"the labels '{path}' cannot be read"
-    with reported_errors(what, "give a file of JSON", OSError, ValueError):
+    remedy = "give another --output" if begun else "give a file of JSON"
+    with reported_errors(f"the labels '{path}' cannot be read", remedy, OSError, ValueError):
         content = read_json(path)
-    return parsed_labels(path, content)
-
-
-def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Stills:
-    """Labels of either kind as they stand in a file; where `begun`, points may still be without
-    any that is visible. Raises ToftrackError, one sentence that names the file."""
     what = f"the labels '{path}' are neither of points nor of stills"
     damaged = KeyError, TypeError, ValueError, IndexError, AttributeError, OverflowError
     remedy = "give a file of toftrack label in which a point was clicked (or see docs/accuracy.md)"
@@ -94,19 +91,18 @@ def parsed_labels(path: Path, content: Any, begun: bool = False) -> Points | Sti
 
 
 def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
-    width, height = (int(side) for side in content["image_size"])
-    side = content["side"]
+    width, height = map(int, content["image_size"])
+    size, side = (width, height), content["side"]
     if side not in ("right", "left"):
         raise ValueError(f"the side is {side!r}")
     if "frames" in content:
-        size = width, height
         given = content["frames"].items()
         frames = {int(key): _visible(frame["points"], size) for key, frame in given}
         if not (any(frames.values()) or begun) or min(frames, default=0) < 0:
             raise ValueError("no frame has a visible point")
         if list(content["frames"]) != [str(number) for number in frames]:
             raise ValueError("a frame's number is written in another way")
-        return Points(path, (width, height), side, frames)
+        return Points(path, size, side, frames, content)
     called = {str(key): tuple(map(str, names)) for key, names in content["called"].items()}
     images = tuple(str(image) for image in content["images"])
     shown = int(content["shown_frames"])
@@ -115,7 +111,7 @@ def _parsed(path: Path, content: Any, begun: bool) -> Points | Stills:
             raise ValueError(f"'called' lacks {image}")
     if not images or not 1 <= shown <= _MOST_SHOWN:
         raise ValueError(f"there is no image to show, or more than {_MOST_SHOWN} times")
-    return Stills(path, (width, height), side, shown, images, called)
+    return Stills(path, size, side, shown, images, called)
 
 
 def _visible(points: Any, size: tuple[int, int]) -> dict[int, tuple[float, float]]:
@@ -147,11 +143,18 @@ def point_rows(
     K: (3, 3), of undistorted pixels.
     Raises ToftrackError when a frame is labelled that the track has not.
     """
-    found = {}
-    for number, off in lateral_errors_mm(points, joints_m, K, TIPS).items():
-        flagged, ok = bool(lost[number]), joint_ok[number][list(off)]
-        errors = np.array(list(off.values()))
-        worst = errors.max()
+    if max(points.frames) >= len(joints_m):
+        raise ToftrackError(
+            f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
+            f"{len(joints_m)} frames; give the recording that was labelled"
+        )
+    moved, found = tips_inset(joints_m, _INSET_M), {}
+    for number, places in points.frames.items():
+        tips = [row for row in places if row in TIPS]
+        if not tips:
+            continue
+        errors = np.array([_lateral_mm(moved[number, row], places[row], K) for row in tips])
+        flagged, ok, worst = bool(lost[number]), joint_ok[number][tips], errors.max()
         found[number] = {
             "tips_20_pct": _pct(worst < 20),
             "tips_40_pct": _pct(worst < 40),
@@ -159,35 +162,15 @@ def point_rows(
             "flagged_pct": _pct(flagged),
             "wrong_no_flag_pct": _pct(not flagged and (ok & (errors > OK_MM)).any()),
             **(dict.fromkeys(FLAG_COUNTS, 0) if flagged else flag_counts(errors, ~ok)),
-            "tips_mm": [round(value, 3) if np.isfinite(value) else None for value in off.values()],
+            "tips_mm": [
+                round(value, 3) if np.isfinite(value) else None for value in errors.tolist()
+            ],
         }
     return found
 
 
 def _pct(so: bool | np.bool_) -> float:
     return 100.0 * bool(so)
-
-
-def lateral_errors_mm(
-    points: Points, joints_m: np.ndarray, K: np.ndarray, rows: Sequence[int]
-) -> dict[int, dict[int, float]]:
-    """How far off those of some joints are that are visible: by frame, if it has any, and joint.
-    Arguments and errors are those of point_rows."""
-    if max(points.frames) >= len(joints_m):
-        raise ToftrackError(
-            f"the labels '{points.path}' are of frame {max(points.frames)}, but the recording has "
-            f"{len(joints_m)} frames; give the recording that was labelled"
-        )
-    moved = tips_inset(joints_m, _INSET_M)
-    found = {
-        number: {
-            row: _lateral_mm(moved[number, row], place, K)
-            for row, place in places.items()
-            if row in rows
-        }
-        for number, places in points.frames.items()
-    }
-    return {number: off for number, off in found.items() if off}
 
 
 def _lateral_mm(point: np.ndarray, place: tuple[float, float], K: np.ndarray) -> float:

@@ -21,8 +21,7 @@ from toftrack.configuration.compose import one_sentence
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.evaluation.image_labels import Points, parsed_labels
-from toftrack.files.json_text import read_json
+from toftrack.evaluation.image_labels import Points, read_labels
 from toftrack.files.safe_files import write_whole
 from toftrack.frames.camera import Camera
 from toftrack.hand.skeleton import FINGERS
@@ -290,18 +289,17 @@ class LabelFile:
         return [*(round(float(one), 2) for one in place), flag]
 
     def _continued(self, recording: str, count: int, side: str | None) -> dict[str, Any]:
-        with reported_errors(
-            f"the labels '{self.path}' cannot be read", "give another --output", OSError, ValueError
-        ):
-            content: dict[str, Any] = read_json(self.path)
-        known = parsed_labels(self.path, content, begun=True)
-        of = content.get("recording", recording)
+        known = read_labels(self.path, begun=True)
         if not isinstance(known, Points):
             why = "of stills, not of points"
-        elif known.size != self._size or max(known.frames, default=0) >= count or of != recording:
+        elif (
+            known.size != self._size
+            or max(known.frames, default=0) >= count
+            or known.content.get("recording", recording) != recording
+        ):
             why = f"of another recording than '{recording}'"
         elif side not in (None, known.side):
             why = f"of a {known.side} hand"
         else:
-            return content
+            return known.content
         raise ToftrackError(f"the labels '{self.path}' are {why}; give another --output")
