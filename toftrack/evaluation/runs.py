@@ -11,13 +11,16 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
+from toftrack.api import build_model
+from toftrack.configuration.compose import configuration, one_sentence
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, Stills, point_rows, read_labels, still_row
@@ -27,26 +30,14 @@ from toftrack.evaluation.rows import Row, group_counts, row_figures
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
 from toftrack.recordings.npz import read_recording
+from toftrack.tracking.model import FilterModel
+from toftrack.tracking.tracker import HandsTracker
 
 SIDES = ("told", "auto")
 _FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
 """What estimates are measured by; a peer's have the first two alone."""
 _SIDE_FIELDS = ("side", "side_probability")
 """What is measured besides where the side is found out."""
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Kept:
-    """Fields of an Estimate that are measured, a tenth of it."""
-
-    joints_m: np.ndarray
-    lost: bool
-    joint_sigma_m: np.ndarray
-    joint_ok: np.ndarray
-    gesture: str
-    side: str
-    side_probability: float
-    compute_s: float
 
 
 @dataclass(frozen=True)
@@ -193,8 +184,6 @@ def _in_processes(todo: Sequence[Job], workers: int) -> Iterator[tuple[Job, list
 
 
 def _begin_worker() -> None:
-    import torch
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the first process says when to end
     torch.set_num_threads(1)  # a core each
 
@@ -235,7 +224,7 @@ def _row(
     job: Job,
     device: Replay,
     truth: Truth,
-    reported: Sequence[Sequence[Kept | PeerEstimate]],
+    reported: Sequence[Sequence[SimpleNamespace | PeerEstimate]],
 ) -> Row:
     track = estimates_of(reported, with_side=job.side == "auto")
     compute_s = np.array([frame[0].compute_s for frame in reported])
@@ -257,13 +246,13 @@ def _row(
 
 def _tracked(
     device: Replay, job: Job, side: str
-) -> tuple[list[tuple[Kept, ...]], list[PeerEstimate]]:
+) -> tuple[list[tuple[SimpleNamespace, ...]], list[PeerEstimate]]:
     """What the tracker says of each frame, and what the peer, if there is one, says after it."""
     peer = None if job.peer is None else peer_process(job.peer)
     if peer is not None:
         peer.begin(device.camera, side if job.side == "told" else "")
     tracker = _tracker(job, side)
-    reported: list[tuple[Kept, ...]] = []
+    reported: list[tuple[SimpleNamespace, ...]] = []
     others: list[PeerEstimate] = []
     for frame in device:
         depth = device.camera.rectify(frame.depth, frame.radial)
@@ -275,13 +264,14 @@ def _tracked(
     return reported, others
 
 
-def kept(estimate: Estimate) -> Kept:
-    """What is kept of an estimate of a recording's frame."""
-    return Kept(**{field.name: getattr(estimate, field.name) for field in fields(Kept)})
+def kept(estimate: Estimate) -> SimpleNamespace:
+    """What is measured of an estimate of a recording's frame, a tenth of it."""
+    names = (*_FIELDS, *_SIDE_FIELDS, "compute_s")
+    return SimpleNamespace(**{name: getattr(estimate, name) for name in names})
 
 
 def estimates_of(
-    reported: Sequence[Sequence[Kept | PeerEstimate]], with_side: bool = False
+    reported: Sequence[Sequence[SimpleNamespace | PeerEstimate]], with_side: bool = False
 ) -> Estimates:
     """What was said in T frames of each slot, by those fields of Estimates that the reported ones
     have, with the side where it was found out; with one slot without its axis."""
@@ -320,21 +310,16 @@ def _expect_one_hand(reported: Sequence[object]) -> None:
         raise ToftrackError("labelled images are of one hand; leave out --hands")
 
 
-def _tracker(job: Job, side: str) -> Any:
+def _tracker(job: Job, side: str) -> HandsTracker:
     """A fresh tracker; the model is the same for all of its configuration."""
-    from toftrack.tracking.tracker import HandsTracker
-
     side = side if job.side == "told" else "auto"
     model, hands = _model(f"hand.side={side}", *job.overrides)
     return HandsTracker(model, job.seed, hands)
 
 
 @functools.lru_cache(maxsize=2)
-def _model(*overrides: str) -> tuple[Any, int]:
+def _model(*overrides: str) -> tuple[FilterModel, int]:
     """The tracker's parts, which keep nothing, and how many hands are followed."""
-    from toftrack.api import build_model
-    from toftrack.configuration.compose import configuration, one_sentence
-
     config = configuration(*overrides)
     with one_sentence():
         return build_model(config), config.get("hands", 1)
