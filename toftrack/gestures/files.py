@@ -54,16 +54,16 @@ def read_poses(path: str | Path) -> list[NamedPose]:
         units, rows = reader(path)
     if not rows:
         raise ToftrackError(f"{path} names no pose")
-    named = [(_name(path, number, row), row) for number, row in enumerate(rows, 1)]
-    angles = np.array([_angles(path, name, row) for name, row in named])
-    spread = np.nan_to_num([_angles(path, name, row.get("spread") or {}) for name, row in named])
+    named = [(_name(path, n, row[0]), row[1], row[2]) for n, row in enumerate(rows, 1)]
+    angles = np.array([_angles(path, name, given) for name, given, _ in named])
+    spread = np.nan_to_num([_angles(path, name, varied) for name, _, varied in named])
     if (spread < 0).any():
         raise ToftrackError(f"{path} has a spread below 0; give standard deviations, 0 or more")
     radians = in_radians(path, angles, units, "say in it that they are {}")
     spread = np.radians(spread) if units == "degrees" else spread
     return [
         NamedPose(name, _within_limits(path, name, pose), varied)
-        for (name, _), pose, varied in zip(named, radians, spread, strict=True)
+        for (name, *_), pose, varied in zip(named, radians, spread, strict=True)
     ]
 
 
@@ -95,21 +95,15 @@ def _in_degrees(angles_rad: np.ndarray) -> dict[str, float]:
     }
 
 
-_Row = Mapping[str, Any]
-
-
-def _name(path: Path, number: int, row: _Row) -> str:
-    name = row.get("name")
+def _name(path: Path, number: int, name: object) -> str:
     if not isinstance(name, str) or not name.strip():
         raise ToftrackError(f"{path}: pose {number} has no name")
     return name.strip()
 
 
-def _angles(path: Path, name: str, row: _Row) -> list[float]:
-    """The 21 angles of a row as they stand there, NaN where there is none."""
-    # A table's cell is no spread, which has values for all angles.
-    known = ("name", *ANGLE_NAMES, *(["spread"] if isinstance(row.get("spread"), dict) else []))
-    unknown = [key for key in row if key not in known]
+def _angles(path: Path, name: str, given: Mapping[str, Any]) -> list[float]:
+    """The 21 angles as they stand there, NaN where there is none."""
+    unknown = [key for key in given if key not in ANGLE_NAMES]
     if unknown:
         raise ToftrackError(
             f"{path}: pose {name!r} has the unknown angle {unknown[0]!r}; known are"
@@ -117,7 +111,7 @@ def _angles(path: Path, name: str, row: _Row) -> list[float]:
         )
     angles = []
     for key in ANGLE_NAMES:
-        value = row.get(key)
+        value = given.get(key)
         if value is None or value == "":
             angles.append(math.nan)
             continue
@@ -145,6 +139,8 @@ def _within_limits(path: Path, name: str, radians: np.ndarray) -> np.ndarray:
     return np.clip(radians, low, high)
 
 
+_Row = tuple[object, Mapping[str, Any], Mapping[str, Any]]
+"""A pose's name, its angles and its spread as they stand there, by the angles' names."""
 _Content = tuple[str | None, list[_Row]]
 
 
@@ -158,7 +154,7 @@ def _read_json(path: Path) -> _Content:
         pose = pose if isinstance(pose, dict) else {}
         angles = _by_name(path, number, "angles", pose.get("angles"))
         spread = _by_name(path, number, "spread", pose.get("spread", {}))
-        rows.append(angles | {"name": pose.get("name"), "spread": spread})
+        rows.append((pose.get("name"), angles, spread))
     units = content.get("units")
     return None if units is None else str(units).lower(), rows
 
@@ -179,7 +175,7 @@ def _read_csv(path: Path) -> _Content:
     units, table = read_table(path)
     if not table or "name" not in table[0]:
         raise ToftrackError(f"{path} has no column 'name'; the header must name it and the angles")
-    return units, list(named_cells(path, table))
+    return units, [(row.pop("name"), row, {}) for row in named_cells(path, table)]
 
 
 _NORMAL_MAD = 1.4826
