@@ -25,7 +25,7 @@ from toftrack.output.run_folder import read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
 from toftrack.render.closed_form import render_range_images
-from toftrack.render.model_image import model_range_image, parted, posed_hand
+from toftrack.render.model_image import model_range_image, posed_hand
 from toftrack.render.reference import ReferenceScorer
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
@@ -143,7 +143,7 @@ def test_classified_pixels_are_those_that_the_scorers_count() -> None:
 def test_a_range_image_is_that_of_the_closed_form(side: str) -> None:
     shape, k = default_hand_shape(side=side), sample().k
     for state in states():
-        hand, _ = parted(posed_hand(state, shape))
+        hand, _ = posed_hand(state, shape)
         exact = render_range_images(hand, torch.tensor(k, dtype=torch.float32), 144, 176)[0]
         drawn = model_range_image(state, shape, k, 144, 176)
         assert drawn.any()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import math
 
 import numpy as np
@@ -11,21 +10,15 @@ import torch
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
+from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import _NEAREST_M
 
 
-@functools.lru_cache(maxsize=4)
-def cpu_surface(shape: HandShape) -> HandSurface:
-    """The surface of a hand on the CPU, made once for as long as a run keeps the shape."""
-    return hand_surface(shape.to("cpu", torch.float32))
-
-
-def posed_hand(state: np.ndarray, shape: HandShape) -> Ellipsoids:
-    """One posed hand, (1, E + 1) ellipsoids on the CPU, the wrist's last.  state: (27,), finite."""
+def posed_hand(state: np.ndarray, shape: HandShape) -> tuple[Ellipsoids, Ellipsoids]:
+    """One posed hand, (1, E) ellipsoids, and its wrist's, (1, 1).  state: (27,), finite.  shape: on
+    the CPU."""
     batch = torch.from_numpy(np.asarray(state, np.float32))[None]
-    pose = forward_kinematics(batch, shape.to("cpu", torch.float32))
-    return cpu_surface(shape).pose(pose)
+    return parted(hand_surface(shape).pose(forward_kinematics(batch, shape)))
 
 
 def parted(both: Ellipsoids) -> tuple[Ellipsoids, Ellipsoids]:
@@ -52,7 +45,7 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
 def _draw(centres, axes, k, image):
     """Z of the nearest of E ellipsoids, (E, 3) and (E, 3, 3), into an image of zeros.  k: (3, 3).
 
-    The formulas are those of closed_form.project.
+    The formulas are those of closed_form.render_range_images.
     """
     height, width = image.shape
     linear, quadratic, box = np.empty(3), np.empty((3, 3)), np.empty(4, np.int64)
@@ -124,5 +117,5 @@ def model_range_image(
     """
     if not np.isfinite(state).all():
         return np.zeros((height, width), np.float32)
-    hand, _ = parted(posed_hand(state, shape))
+    hand, _ = posed_hand(state, shape)
     return range_image(hand, k, height, width)

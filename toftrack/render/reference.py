@@ -14,7 +14,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, HandSurface, hand_surface
+from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.render.closed_form import pixel_rays, render_range_images
 from toftrack.render.model_image import parted
 from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
@@ -55,7 +55,7 @@ def step_range_images(
 
 
 class PixelClasses(NamedTuple):
-    """What each pixel of N range images is, (N, H, W) bool each (paper, fig. 3); see Counts.
+    """What each pixel of N range images is, (N, H, W) each (paper, fig. 3); see Counts.
 
     near: pixels within the evidence's radius of the silhouette, outside of it and of the wrist's:
         the neighbourhood, in which hand pixels are missed.
@@ -64,6 +64,7 @@ class PixelClasses(NamedTuple):
     correct: Tensor
     false: Tensor
     missed: Tensor
+    residual: Tensor
     near: Tensor
 
 
@@ -76,9 +77,9 @@ def classify_range_images(
     reach: (N, H, W) bool, pixels within the evidence's radius of the surface.
     """
     model = depth_m > 0
-    correct, false, _ = compare(torch.where(model, 1.0 / depth_m, 0.0), evidence)
+    correct, false, residual = compare(torch.where(model, 1.0 / depth_m, 0.0), evidence)
     near = reach & ~model & ~wrist
-    return PixelClasses(correct, false, evidence.hand & near, near)
+    return PixelClasses(correct, false, evidence.hand & near, residual, near)
 
 
 class ReferenceScorer:
@@ -89,7 +90,7 @@ class ReferenceScorer:
     def __init__(self, shape: HandShape, chunk: int = 8, stepping: bool = False) -> None:
         """chunk: hypotheses rendered at once.  stepping: find surfaces as the paper does."""
         self.shape = shape
-        self.surface: HandSurface = hand_surface(shape)
+        self.surface = hand_surface(shape)
         self.chunk = chunk
         self.render = step_range_images if stepping else render_range_images
 
@@ -105,7 +106,5 @@ class ReferenceScorer:
         depth_m = self.render(hand, *view)
         on_wrist = render_range_images(wrist, *view) > 0
         reach = dilate_disc(depth_m > 0, evidence.radius_px)
-        correct, false, missed, _ = classify_range_images(depth_m, on_wrist, reach, evidence)
-        residual = compare(torch.where(depth_m > 0, 1.0 / depth_m, 0.0), evidence)[2]
-        images = correct, false, missed, residual
+        *images, _ = classify_range_images(depth_m, on_wrist, reach, evidence)
         return torch.stack([image.flatten(1).sum(1).float() for image in images])

@@ -8,7 +8,7 @@ import torch
 
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import Likelihood
-from toftrack.render.model_image import parted, posed_hand, range_image
+from toftrack.render.model_image import posed_hand, range_image
 from toftrack.render.reference import classify_range_images
 from toftrack.render.segmentation import Observation
 
@@ -37,7 +37,7 @@ def classify(
     height, width = evidence.hand.shape
     if not np.isfinite(state).all():
         return np.zeros((height, width), np.float32), np.zeros((height, width), np.uint8)
-    hand, wrist = parted(posed_hand(state, shape))
+    hand, wrist = posed_hand(state, shape)
     k = evidence.k.numpy()
     range_m = range_image(hand, k, height, width)
     on_wrist = range_image(wrist, k, height, width) > 0

@@ -38,8 +38,9 @@ from toftrack.files.safe_files import open_new
 from toftrack.frames.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import JOINT_PARENTS
+from toftrack.hand.surface import hand_surface
 from toftrack.render.likelihood import Likelihood
-from toftrack.render.model_image import cpu_surface, parted, posed_hand
+from toftrack.render.model_image import posed_hand
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.state import StepInfo
 from toftrack.views.base import TrackedFrame, TrackedHand, View
@@ -385,13 +386,13 @@ def _bone_strips(
 
 def _ellipsoids(estimate: Estimate, shape: HandShape) -> rr.Ellipsoids3D:
     """The posed hand without its wrist, in the fingers' colours; all in one when it is lost."""
-    hand, _ = parted(posed_hand(estimate.state, shape))
+    hand, _ = posed_hand(estimate.state, shape)
     axes = hand.axes_m[0]
     sizes = axes.norm(dim=-2)
     rotations = axes / sizes[:, None]
     # A left hand's frames are mirrored. An ellipsoid does not mind turning an axis around.
     rotations[..., 0] *= torch.linalg.det(rotations).sign()[:, None]
-    bones = cpu_surface(shape).frame_index[:-1]
+    bones = hand_surface(shape).frame_index[:-1]
     palette = torch.tensor((_PALM_RGB, *FINGER_RGB))
     colours = palette[torch.where(bones > 0, 1 + (bones - 1) // 3, 0)].numpy()
     return rr.Ellipsoids3D(
