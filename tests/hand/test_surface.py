@@ -7,8 +7,7 @@ from torch import Tensor
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.model_image import parted
+from toftrack.hand.surface import Ellipsoids, hand_surface, parted
 
 SHAPE = default_hand_shape().to(torch.float64)
 SURFACE = hand_surface(SHAPE)

@@ -24,9 +24,8 @@ from toftrack.output.lines import HAND_FIELDS
 from toftrack.output.run_folder import read_run
 from toftrack.programs import command_line, figures
 from toftrack.programs.figures import draw_figures
-from toftrack.render.closed_form import render_range_images
 from toftrack.render.model_image import model_range_image, posed_hand
-from toftrack.render.reference import ReferenceScorer
+from toftrack.render.reference import ReferenceScorer, render_range_images
 from toftrack.render.segmentation import Expected
 from toftrack.tracking.backend import make_scorer
 from toftrack.views.classified import CLASSES, classify

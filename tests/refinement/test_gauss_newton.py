@@ -17,14 +17,13 @@ from torch import Tensor
 from toftrack.evaluation.trust import TIPS
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import hand_surface
+from toftrack.hand.surface import hand_surface, parted
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.pose_space.inverse_kinematics import fit_angles
 from toftrack.refinement.gauss_newton import Keypoints, Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
 from toftrack.refinement.seen_points import SeenPoints, seen_points
-from toftrack.render.closed_form import render_range_images
-from toftrack.render.model_image import parted
+from toftrack.render.reference import render_range_images
 from toftrack.render.segmentation import Observation
 
 K = torch.tensor([[220.0, 0.0, 88.0], [0.0, 220.0, 72.0], [0.0, 0.0, 1.0]])

@@ -14,12 +14,10 @@ import torch
 from toftrack.compute.compiling import entry_point
 from toftrack.hand.shape import HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.closed_form import render_range_images
-from toftrack.render.model_image import parted
+from toftrack.hand.surface import Ellipsoids, hand_surface, parted
 from toftrack.render.numba import kernel
 from toftrack.render.numba.vector import WORDS
-from toftrack.render.reference import ReferenceScorer, step_range_images
+from toftrack.render.reference import ReferenceScorer, render_range_images, step_range_images
 from toftrack.render.scoring import Counts, Evidence, dilate_disc, disc_square, disc_steps
 from toftrack.render.torch_scorer import rendered_depths
 from toftrack.tracking.backend import choose_backend, make_scorer

@@ -19,7 +19,7 @@ from helpers.detection import (
 )
 
 from toftrack.hand.surface import Ellipsoids
-from toftrack.render.closed_form import render_range_images
+from toftrack.render.reference import render_range_images
 from toftrack.training import pictures
 from toftrack.training.hands import BACKGROUND, FOREARM, HAND, posed_hands
 from toftrack.training.pictures import random_sensors, take_pictures

@@ -21,7 +21,7 @@ from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
 from toftrack.pose_space.data.pose_data import basic_pose
-from toftrack.render.closed_form import render_range_images
+from toftrack.render.reference import render_range_images
 
 _CAMERA = Camera(np.array([[200.0, 0, 88], [0, 200.0, 72], [0, 0, 1]]), 176, 144)
 _WALL_M = 1.5

@@ -87,6 +87,12 @@ class Ellipsoids(NamedTuple):
     axes_m: Tensor
 
 
+def parted(both: Ellipsoids) -> tuple[Ellipsoids, Ellipsoids]:
+    """The hand's own ellipsoids, and the wrist's."""
+    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
+    return hand, Ellipsoids(both.centres_m[:, -1:], both.axes_m[:, -1:])
+
+
 @dataclass(frozen=True, eq=False)
 class HandSurface:
     """Ellipsoids attached to the 16 frames of a HandPose; the last one is the wrist's.

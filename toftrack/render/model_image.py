@@ -10,8 +10,8 @@ import torch
 from toftrack.compute.compiling import compiled, entry_point
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.closed_form import _NEAREST_M
+from toftrack.hand.surface import Ellipsoids, hand_surface, parted
+from toftrack.render.scoring import NEAREST_M
 
 
 def posed_hand(state: np.ndarray, shape: HandShape) -> tuple[Ellipsoids, Ellipsoids]:
@@ -19,12 +19,6 @@ def posed_hand(state: np.ndarray, shape: HandShape) -> tuple[Ellipsoids, Ellipso
     the CPU."""
     batch = torch.from_numpy(np.asarray(state, np.float32))[None]
     return parted(hand_surface(shape).pose(forward_kinematics(batch, shape)))
-
-
-def parted(both: Ellipsoids) -> tuple[Ellipsoids, Ellipsoids]:
-    """The hand's own ellipsoids, and the wrist's."""
-    hand = Ellipsoids(both.centres_m[:, :-1], both.axes_m[:, :-1])
-    return hand, Ellipsoids(both.centres_m[:, -1:], both.axes_m[:, -1:])
 
 
 def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) -> np.ndarray:
@@ -45,7 +39,7 @@ def range_image(ellipsoids: Ellipsoids, k: np.ndarray, height: int, width: int) 
 def _draw(centres, axes, k, image):
     """Z of the nearest of E ellipsoids, (E, 3) and (E, 3, 3), into an image of zeros.  k: (3, 3).
 
-    The formulas are those of closed_form.render_range_images.
+    The formulas are those of reference.render_range_images.
     """
     height, width = image.shape
     linear, quadratic, box = np.empty(3), np.empty((3, 3)), np.empty(4, np.int64)
@@ -82,7 +76,7 @@ def _project(centre, axes, k, height, width, linear, quadratic, box):
             whiten[j, i] = axes[i, j] / size
             s[j] += whiten[j, i] * centre[i]
         square += s[j] * s[j]
-    if not centre[2] - math.sqrt(reach) > _NEAREST_M:
+    if not centre[2] - math.sqrt(reach) > NEAREST_M:
         return False
     for i in range(3):
         back = whiten[0, i] * s[0] + whiten[1, i] * s[1] + whiten[2, i] * s[2]

@@ -19,6 +19,10 @@ from torch import Tensor
 
 from toftrack.compute.transfer import on_device
 
+NEAREST_M = 0.02
+"""Ellipsoids that come nearer to the camera's centre plane than this are not drawn: inside or
+behind the camera the closed form has no meaning."""
+
 
 @dataclass(frozen=True, eq=False)
 class Evidence:

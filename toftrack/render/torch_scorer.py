@@ -16,8 +16,7 @@ from torch import Tensor
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import Ellipsoids, hand_surface
-from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.scoring import Counts, Evidence, compare, dilate_disc
+from toftrack.render.scoring import NEAREST_M, Counts, Evidence, compare, dilate_disc
 
 _CHUNK_PIXELS = {"cpu": 1 << 20, "cuda": 1 << 27}
 """Pixels of a chunk of particles: small enough for the cache, large enough for a GPU."""
@@ -50,7 +49,7 @@ def outlines(ellipsoids: Ellipsoids, k: Tensor) -> Outlines:
     s = ellipsoids.axes_m @ ellipsoids.axes_m.mT
     xx, xy, xz = s[..., 0, 0], s[..., 0, 1], s[..., 0, 2]
     yy, yz, zz = s[..., 1, 1], s[..., 1, 2], s[..., 2, 2]
-    visible = cz - zz.sqrt() > _NEAREST_M
+    visible = cz - zz.sqrt() > NEAREST_M
     z2 = cz.square()
     w = 1 / (z2 - zz)
     w2 = w.square()

@@ -13,7 +13,7 @@ order (K = L D L') yields the rows, the exact span of columns in a row, and the 
 
     u = u0 + L_uy dy + L_ux t + sqrt(D_u (1 - dy^2 / D_y - t^2 / D_x)),   t = dx - L_xy dy.
 
-This is the form of closed_form.py in other coordinates."""
+This is the form of reference.py in other coordinates."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ import math
 import numpy as np
 
 from toftrack.compute.compiling import compiled
-from toftrack.render.closed_form import _NEAREST_M
 from toftrack.render.numba.vector import (
     BLOCK,
     down,
@@ -35,10 +34,11 @@ from toftrack.render.numba.vector import (
     up,
     where_above,
 )
+from toftrack.render.scoring import NEAREST_M
 
 LANES = BLOCK
 """Particles whose kinematics are computed side by side, one to a SIMD lane; a task of a thread."""
-_NEAREST = np.float32(_NEAREST_M)
+_NEAREST = np.float32(NEAREST_M)
 _ZERO, _HALF, _ONE, _TWO = (np.float32(number) for number in (0, 0.5, 1, 2))
 _LARGEST = np.float32(1e9)
 # Rows of the table of coefficients of an ellipsoid.

@@ -17,8 +17,7 @@ from toftrack.compute.transfer import on_device
 from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import CHAIN_SLOTS
 from toftrack.hand.surface import hand_surface
-from toftrack.render.closed_form import _NEAREST_M
-from toftrack.render.scoring import Counts, Evidence, disc_square, disc_steps
+from toftrack.render.scoring import NEAREST_M, Counts, Evidence, disc_square, disc_steps
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.render.triton.kernel import (
     TERMS,
@@ -98,7 +97,7 @@ class TritonScorer:
         count = len(self._numbers)
         conics = torch.empty(n, count, TERMS, device=device)
         project_kernel[(triton.cdiv(n, _BLOCK), count)](
-            states, camera, self._numbers, self._slots, conics, n, count, _NEAREST_M, BLOCK=_BLOCK
+            states, camera, self._numbers, self._slots, conics, n, count, NEAREST_M, BLOCK=_BLOCK
         )
         model = torch.empty(n, height, words, dtype=torch.int64, device=device)
         boxes = torch.empty(n, 4, dtype=torch.int32, device=device)
