@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
+import torch
+
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.surface import hand_surface
 
@@ -37,4 +39,4 @@ def test_hands_that_share_their_sizes_are_one_key() -> None:
     hand = default_hand_shape()
     assert replace(hand) == hand and len({replace(hand), hand}) == 1
     assert hand_surface(replace(hand)) is hand_surface(hand)
-    assert hand != hand.scaled(1.0) and hand != replace(hand, side="left") and hand != "hand"
+    assert hand != hand.to(torch.float64) and hand != replace(hand, side="left") and hand != "hand"

@@ -15,7 +15,7 @@ from toftrack.compute.rigid import PIVOT_M
 from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.proposals import Places
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
 
@@ -33,7 +33,7 @@ def test_states_are_the_hypotheses_as_a_hand_has_them(side: str) -> None:
     seen = detection(side)
     for row in (0, 7, 11):
         ratio = float(seen.log_size[row].exp())
-        shape = default_hand_shape(side=side).scaled(ratio)
+        shape = default_hand_shape(DEFAULT_HAND_LENGTH_M * ratio, side)
         joints = forward_kinematics(seen.states(ratio)[row : row + 1], shape).joints_m[0]
         assert float((joints - seen.joints_m[row]).norm(dim=1).max()) < 1e-3
 

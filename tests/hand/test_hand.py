@@ -73,8 +73,10 @@ def test_scaling_the_shape_scales_joints_and_ellipsoids() -> None:
     shape = default_hand_shape().to(torch.float64)
     states = random_states(3)
     states[:, :3] = 0
+    sizes = {"base_m": 1.2 * shape.base_m, "bone_lengths_m": 1.2 * shape.bone_lengths_m}
     small, large = (
-        hand_surface(s).pose(forward_kinematics(states, s)) for s in (shape, shape.scaled(1.2))
+        hand_surface(s).pose(forward_kinematics(states, s))
+        for s in (shape, dataclasses.replace(shape, **sizes))
     )
     torch.testing.assert_close(large.centres_m, 1.2 * small.centres_m)
     torch.testing.assert_close(large.axes_m, 1.2 * small.axes_m)

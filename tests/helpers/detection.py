@@ -18,7 +18,7 @@ from toftrack.detector.detection import Detection
 from toftrack.detector.network import Finder, PoseNet
 from toftrack.detector.proposals import Places
 from toftrack.detector.weights import make_ready
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 from toftrack.refinement.gauss_newton import Keypoints
 from toftrack.training.dice import Dice
@@ -113,7 +113,7 @@ def clean_picture(
 def detection_of(states: torch.Tensor, log_size: float = 0.0, side: str = "right") -> Detection:
     """What a network that is sure would say: hands (H, 27) of one size, the first the likeliest."""
     count = len(states)
-    shape = default_hand_shape(side=side).scaled(math.exp(log_size))
+    shape = default_hand_shape(DEFAULT_HAND_LENGTH_M * math.exp(log_size), side)
     joints = forward_kinematics(states, shape).joints_m
     pivot = rotated_pivot(states[:, 3:6]) * math.exp(log_size)
     return Detection(

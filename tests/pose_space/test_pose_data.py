@@ -18,7 +18,7 @@ from helpers.tracking import ROOT, configuration
 from reference.refinement import moved
 
 from toftrack.errors import ToftrackError
-from toftrack.hand.shape import default_hand_shape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
 from toftrack.pose_space.data.leap import leap_data
 from toftrack.pose_space.data.pose_data import (
@@ -352,7 +352,7 @@ def joints_of(angles: torch.Tensor, scale: float = 1.0, seed: int = 0) -> torch.
     """(T, 5, 4, 3) metres of hands anywhere in space."""
     generator = torch.Generator().manual_seed(seed)
     placed = torch.randn(len(angles), 6, generator=generator, dtype=torch.float64)
-    shape = default_hand_shape().to(torch.float64).scaled(scale)
+    shape = default_hand_shape(scale * DEFAULT_HAND_LENGTH_M).to(torch.float64)
     joints = forward_kinematics(torch.cat((placed, angles), 1), shape).joints_m[:, 1:]
     return joints.unflatten(1, (5, 4))
 
@@ -385,7 +385,7 @@ def test_the_jacobian_of_the_joints_is_their_derivative() -> None:
 
 def test_a_recorded_hand_gives_its_own_bones() -> None:
     shape = shape_of_joints(joints_of(random_angles(10), scale=0.9), default_hand_shape())
-    expected = default_hand_shape().scaled(0.9)
+    expected = default_hand_shape(0.9 * DEFAULT_HAND_LENGTH_M)
     torch.testing.assert_close(shape.bone_lengths_m, expected.bone_lengths_m, atol=1e-6, rtol=0)
     torch.testing.assert_close(shape.base_m, expected.base_m, atol=1e-5, rtol=0)
 

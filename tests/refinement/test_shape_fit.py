@@ -103,7 +103,7 @@ def test_a_hand_is_found_in_different_poses_and_the_fit_says_how_surely() -> Non
     applied = shaped(default_hand_shape(), torch.tensor(belief.applied))
     assert applied.hand_length_m == pytest.approx(shape.hand_length_m, rel=0.04)
     off = (applied.bone_lengths_m.sum(1) / shape.bone_lengths_m.sum(1)).log()
-    before = default_hand_shape().scaled(math.exp(0.05)).bone_lengths_m.sum(1)
+    before = default_hand_shape(DEFAULT_HAND_LENGTH_M * math.exp(0.05)).bone_lengths_m.sum(1)
     assert off.square().mean() < 0.6 * (before / shape.bone_lengths_m.sum(1)).log().square().mean()
     sigma = belief.summary().sigma
     assert sigma[0] < 0.5 * POPULATION_SIGMA[0]  # what is alike in all frames stays

@@ -153,12 +153,6 @@ class HandShape:
         """Wrist to the middle finger's tip when the finger is straight."""
         return float(self.base_m[2].norm() + self.bone_lengths_m[2].sum())
 
-    def scaled(self, factor: float) -> HandShape:
-        """The whole hand larger or smaller, thicknesses with it."""
-        return replace(
-            self, base_m=self.base_m * factor, bone_lengths_m=self.bone_lengths_m * factor
-        )
-
     def of_side(self, side: str) -> HandShape:
         """The mirror image, or the same; ToftrackError for an unknown side."""
         if side not in SIDES:
