@@ -45,14 +45,13 @@ import numpy as np
 from toftrack.evaluation.statistics import figure, share_pct
 from toftrack.evaluation.trust import (
     OK_MM,
-    RIGHT_FRAMES,
     RIGHT_MM,
     TIPS,
     Judged,
     Trust,
     judged,
-    runs,
     slots_of_hands,
+    steady,
     trust,
     until,
 )
@@ -269,7 +268,7 @@ def evaluate(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> dict[str, 
         said, gone = flagged[rows], ~of.seen[rows]
         metrics[f"lost_precision{suffix}"] = figure(gone[said])
         metrics[f"lost_recall{suffix}"] = figure(said[gone])
-    found = runs(of.said & (of.mean_mm < RIGHT_MM), RIGHT_FRAMES, cut=True)
+    found = steady(of.said & (of.mean_mm < RIGHT_MM), cut=True)
     metrics["reacquisition"] = [
         {"event": event, "frame": frame, "delay": _delay(found, present, frame)}
         for event, frame in _events(truth)

@@ -90,7 +90,7 @@ class Judged:
 def trust(of: Judged) -> Trust:
     """The figures of a track whose frames were judged, unrounded."""
     average, seen = of.mean_mm, of.seen
-    right = runs(seen & of.said & (average < RIGHT_MM), RIGHT_FRAMES)
+    right = steady(seen & of.said & (average < RIGHT_MM))
     returns = np.flatnonzero(seen[1:] & ~seen[:-1]) + 1
     return Trust(
         frames=len(seen),
@@ -119,7 +119,10 @@ def judged(joints_m: np.ndarray, lost: np.ndarray, truth: Truth) -> Judged:
     there, error = joint_errors_mm(estimate, truth)
     average, largest = error.mean(1), error.max(1)
     said = ~lost & there
-    wrong = np.where(seen, average > OK_MM, ~lingering(seen, FORGIVEN_FRAMES))
+    recent = seen.copy()
+    for back in range(1, FORGIVEN_FRAMES + 1):
+        recent[back:] |= seen[:-back]
+    wrong = np.where(seen, average > OK_MM, ~recent)
     return Judged(
         seen=seen,
         there=there,
@@ -176,20 +179,11 @@ def slots_of_hands(
     return tuple(linear_sum_assignment(costs)[1].tolist())
 
 
-def lingering(visible: np.ndarray, frames: int) -> np.ndarray:
-    """(T,) bool: the hand is visible, or was at most so many frames ago."""
-    recent = visible.copy()
-    for back in range(1, frames + 1):
-        recent[back:] |= visible[:-back]
-    return recent
-
-
-def runs(flags: np.ndarray, length: int, cut: bool = False) -> np.ndarray:
-    """(T,) bool: the frame and those after it, `length` together (with `cut`, fewer at the end of
-    the recording), are all true."""
-    longer = np.concatenate([flags, np.full(length - 1, cut)])
-    steady: np.ndarray = np.all([longer[i : i + len(flags)] for i in range(length)], axis=0)
-    return steady
+def steady(flags: np.ndarray, cut: bool = False) -> np.ndarray:
+    """(T,) bool: RIGHT_FRAMES from there on (with `cut`, fewer at the recording's end) are true."""
+    longer = np.concatenate([flags, np.full(RIGHT_FRAMES - 1, cut)])
+    shifted = [longer[i : i + len(flags)] for i in range(RIGHT_FRAMES)]
+    return np.asarray(np.all(shifted, axis=0))
 
 
 def until(flags: np.ndarray, frame: int) -> int | None:
