@@ -8,7 +8,7 @@ import torch
 from helpers.settings import part
 
 from toftrack.errors import ToftrackError
-from toftrack.gestures.pinch import PinchSettings, PinchState, pinch_of, tip_gap, update_pinch
+from toftrack.gestures.pinch import PinchSettings, PinchState, pinch_of, update_pinch
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
 
@@ -53,7 +53,9 @@ def test_a_tip_that_is_not_ok_begins_no_pinch_and_ends_one() -> None:
 
 
 def test_a_small_hand_pinches_as_a_large_one() -> None:
-    assert tip_gap(joints(0.3, 0.14)) == pytest.approx(tip_gap(joints(0.3, 0.21)), abs=1e-4)
+    for opened in np.linspace(0, 1, 11):
+        small, large = (pinch_of(joints(opened, length_m), SETTINGS) for length_m in (0.14, 0.21))
+        assert small == pytest.approx(large, abs=1e-3)
 
 
 def test_a_pinch_that_trembles_about_a_threshold_begins_and_ends_once() -> None:

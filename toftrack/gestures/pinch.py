@@ -70,17 +70,12 @@ def _tip_radii() -> tuple[float, float]:
     return thumb, index
 
 
-def tip_gap(joints_m: np.ndarray) -> float:
-    """Between the surfaces of thumb tip and index tip, in lengths of the hand; below 0 in overlap.
-
-    joints_m: (21, 3) metres.
-    """
-    return float(gap_between(joints_m, *_tip_radii()))
-
-
 @entry_point
 def gap_between(joints, thumb, index):
-    """See tip_gap; of the radii of thumb tip and index tip, in lengths of the hand."""
+    """Between the surfaces of thumb tip and index tip; below 0 in overlap.
+
+    joints: (21, 3).  thumb, index: radii of the tips; like the gap in lengths of the hand.
+    """
     length = distance(joints[0], joints[_MIDDLE])
     for joint in range(_MIDDLE, _MIDDLE + 3):
         length += distance(joints[joint], joints[joint + 1])
@@ -101,7 +96,8 @@ def pinch_of(
     """
     if joint_ok is not None and not joint_ok[_ENDS].all():
         return math.nan
-    part = (settings.open - tip_gap(joints_m)) / (settings.open - settings.touching)
+    gap = float(gap_between(joints_m, *_tip_radii()))
+    part = (settings.open - gap) / (settings.open - settings.touching)
     return min(max(part, 0.0), 1.0)
 
 
