@@ -454,18 +454,17 @@ class Refiner:
             _array(surface.axes_m[:-1]),
         )
 
-    def joints(self, states: Tensor) -> Tensor:
-        """(N, 27) to the joints (N, 21, 3), camera frame, metres."""
+    def joints(self, states: Tensor, frames: np.ndarray = _NO_FRAMES) -> Tensor:
+        """(N, 27) to the joints (N, 21, 3), camera frame, metres; the frames are written, too."""
         joints = np.empty((len(states), 21, 3), np.float32)
         states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints, _NO_FRAMES)
+        joints_of(states_read, *self._shape, joints, frames)
         return torch.from_numpy(joints)
 
     def pose(self, states: Tensor) -> HandPose:
         """(N, 27) to joints and frames, see skeleton.forward_kinematics."""
-        joints, frames = torch.empty(len(states), 21, 3), torch.empty(len(states), 16, 3, 3)
-        states_read = np.ascontiguousarray(states.numpy(), np.float32)
-        joints_of(states_read, *self._shape, joints.numpy(), frames.numpy())
+        frames = torch.empty(len(states), 16, 3, 3)
+        joints = self.joints(states, frames.numpy())
         return HandPose(joints, frames, joints[:, _ORIGINS])
 
     def surface(self, state: Tensor) -> Ellipsoids:
