@@ -9,7 +9,14 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from toftrack.evaluation.figures import kept_keys
+from toftrack.evaluation.figures import FIGURES
+
+
+def kept_keys(table: str) -> tuple[str, ...]:
+    """Of a table's figures, what of their totals is kept."""
+    kept = [f for f in FIGURES if {table, "history"} <= set(f.shown.split())]
+    return tuple(f"median_{f.key}" if f.over == "median" else f.key for f in kept)
+
 
 NOT_YET = "not measured yet"
 HISTORY_KEYS = ("usable_pct", "usable_90", *kept_keys("each")[1:])

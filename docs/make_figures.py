@@ -29,11 +29,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from toftrack.evaluation.figures import kept_keys
-
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
-from figure_tables import HISTORY_KEYS, history_row, history_rows, with_tables  # noqa: E402
+from figure_tables import HISTORY_KEYS, history_row, history_rows, kept_keys, with_tables  # noqa: E402
 
 DATA = ROOT / "tests" / "data"
 FIGURES = ROOT / "docs" / "figures.json"

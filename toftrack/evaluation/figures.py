@@ -82,12 +82,6 @@ def columns(table: str) -> Columns:
     return tuple((f.heading, f.key, f.digits) for f in FIGURES if table in f.shown.split())
 
 
-def kept_keys(table: str) -> tuple[str, ...]:
-    """Of a table's figures, what of their totals is kept."""
-    kept = [f for f in FIGURES if {table, "history"} <= set(f.shown.split())]
-    return tuple(f"median_{f.key}" if f.over == "median" else f.key for f in kept)
-
-
 SHARES = ("usable_pct", "partly_pct", "silent_pct", "false_alarm_pct")
 MEANS = tuple(dict.fromkeys((*SHARES, "mean_mm", *keys_over("mean"))))
 """Figures whose total is the mean over recordings, with an interval, in the order of the files."""
