@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from threadpoolctl import threadpool_limits
 
@@ -116,7 +115,17 @@ def load_pose_space(path: str | Path, configured: str = "pca") -> PoseSpace:
     """Read a model file; ToftrackError when it is not one of this version and size, or its kind is
     neither the configured one nor one that kind_of_space knows.
     """
-    header, arrays = _read(path)
+    what = f"{path} is not a pose-space file"
+    with reported_errors(what, _ADVICE, OSError, ValueError, KeyError):
+        arrays = read_archive(path)
+        header = parse_json(str(arrays.pop("header")))
+        if not isinstance(header, dict) or header.get("format") != FORMAT:
+            raise ValueError("its header is another")
+    if header.get("version") != VERSION:
+        raise ToftrackError(
+            f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
+            f" version {VERSION}; {_ADVICE}"
+        )
     kind, labels = header.get("kind"), header.get("training_labels")
     made = kind_of_space(configured)
     if kind != made.kind:
@@ -145,22 +154,6 @@ def load_pose_space(path: str | Path, configured: str = "pca") -> PoseSpace:
             raise ValueError("bounds or labels do not fit")
         space.encode(angles[:1])
     return space
-
-
-def _read(path: str | Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Header and arrays of a file of this format and version."""
-    what = f"{path} is not a pose-space file"
-    with reported_errors(what, _ADVICE, OSError, ValueError, KeyError):
-        content = read_archive(path)
-        header = parse_json(str(content.pop("header")))
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ValueError("its header is another")
-    if header.get("version") != VERSION:
-        raise ToftrackError(
-            f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
-            f" version {VERSION}; {_ADVICE}"
-        )
-    return header, content
 
 
 def make_pose_space(
