@@ -134,6 +134,10 @@ def test_what_cannot_be_measured_is_said_in_one_sentence(folder, tmp_path) -> No
         ([str(folder), str(folder)], "two recordings are called 'short/a'"),
         ([str(folder), "--compare", str(tmp_path / "old.json")], "has no 'rows'"),
         ([str(folder), "--labels", str(tmp_path / "labels.json")], "cannot be read"),
+        (
+            [str(folder), "--labels", "labels.json", "--hands", "2"],
+            "leave out --hands, or --labels",
+        ),
         ([str(folder), "--json", str(tmp_path / "no" / "a.json")], "its folder does not exist"),
         ([str(folder), "hand.side=left"], "--side"),
         ([str(folder), "pose_space=pca,lle"], "pose_space=pca,lle has several values; give one"),

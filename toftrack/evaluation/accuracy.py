@@ -73,6 +73,8 @@ def measure(
     """Track, measure and report, with `draw` for the picture; an interruption reports what is done
     before it is passed on. Raises ToftrackError: something that was given cannot be used."""
     paths, overrides = _divided(options.what, options.hands)
+    if options.labels and options.hands > 1:
+        raise ToftrackError("labelled images are of one hand; leave out --hands, or --labels")
     results.checked_targets(options.json, options.markdown, options.picture)
     others = None if options.compare is None else results.read_rows(options.compare)
     found = sources(paths, options.labels)

@@ -286,7 +286,6 @@ def estimates_of(
 
 def _points(job: Job, device: Replay, labels: Points) -> Iterator[tuple[int, Row]]:
     reported, _ = _tracked(device, job, labels.side)
-    _expect_one_hand(reported[0])
     track = estimates_of(reported)
     assert track.joint_ok is not None
     rows = point_rows(labels, track.joints_m, track.lost, track.joint_ok, device.camera.K)
@@ -299,15 +298,9 @@ def _stills(job: Job, device: Replay, labels: Stills) -> Iterator[tuple[int, Row
         depth = device.camera.rectify(frame.depth, frame.radial)
         tracker = _tracker(job, labels.side)
         for index in range(labels.shown_frames):
-            reported = tracker.step(depth, device.camera.K, index, index / device.fps)
-        _expect_one_hand(reported)
-        figures = still_row(reported[0].gesture, reported[0].lost, labels.called[shown])
-        yield number, {"kind": "stills", "shown": shown, "gesture": reported[0].gesture, **figures}
-
-
-def _expect_one_hand(reported: Sequence[object]) -> None:
-    if len(reported) != 1:
-        raise ToftrackError("labelled images are of one hand; leave out --hands")
+            (seen,) = tracker.step(depth, device.camera.K, index, index / device.fps)
+        figures = still_row(seen.gesture, seen.lost, labels.called[shown])
+        yield number, {"kind": "stills", "shown": shown, "gesture": seen.gesture, **figures}
 
 
 def _tracker(job: Job, side: str) -> HandsTracker:
