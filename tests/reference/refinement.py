@@ -111,7 +111,7 @@ def refine(
     points, there = points_around(seen, middle, settings.points)
     informed = there.any(1)
     if keypoints is not None:
-        keypoints = keypoints.of_each(len(states))
+        keypoints = of_each(keypoints, len(states))
         informed = informed | keypoints.sigma_m.isfinite().any(1)
     refined = states
     for _ in range(settings.iterations):
@@ -226,10 +226,18 @@ def nearest_px(seen: SeenPoints, row: Tensor, column: Tensor) -> Tensor:
     return found.flip(1).to(seen.k.dtype).reshape(*row.shape, 2)
 
 
+def of_each(keypoints: Keypoints, n: int) -> Keypoints:
+    """(n, 21, 3) and (n, 21); what is no number becomes a joint that was not found."""
+    points, sigma = keypoints.points_m.expand(n, 21, 3), keypoints.sigma_m
+    known = points.isfinite().all(-1) & (sigma > 0)
+    found = torch.where(known, sigma, torch.inf)
+    return Keypoints(torch.where(known[..., None], points, 0.0), found)
+
+
 def keypoint_residuals(hand: Moving, keypoints: Keypoints) -> Residuals:
     """Of the joints: how far they are from their keypoints, along each of the camera's axes.
 
-    keypoints: of each of the N hands, see Keypoints.of_each.
+    keypoints: of each of the N hands, see of_each.
     """
     gap = hand.pose.joints_m - keypoints.points_m
     sigma = keypoints.sigma_m

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from toftrack.errors import check_number
@@ -75,10 +74,3 @@ class Keypoints:
 
     points_m: Tensor
     sigma_m: Tensor
-
-    def of_each(self, n: int) -> Keypoints:
-        """(n, 21, 3) and (n, 21); what is no number becomes a joint that was not found."""
-        points = self.points_m.expand(n, 21, 3)
-        known = points.isfinite().all(-1) & (self.sigma_m > 0)
-        sigma = torch.where(known, self.sigma_m, torch.inf)
-        return Keypoints(torch.where(known[..., None], points, 0.0), sigma)

@@ -267,9 +267,10 @@ def keypoints_system(
     Returns the precision (6, 6) and the precision times the change of the components (6,).
     """
     # In numpy: on a few numbers each of torch's operations takes longer than its arithmetic.
-    keypoints = keypoints.of_each(1)
-    gap = (pose.joints_m - keypoints.points_m)[0].numpy()
-    sigma = keypoints.sigma_m[0].numpy()
+    points, sigma = keypoints.points_m.numpy(), keypoints.sigma_m.numpy()
+    known = np.isfinite(points).all(1) & (sigma > 0)  # what is no number was not found
+    gap = pose.joints_m[0].numpy() - np.where(known[:, None], points, 0)
+    sigma = np.where(known, sigma, np.inf)
     away = np.square(np.linalg.norm(gap, axis=1) / (KEYPOINT_SIGMAS * sigma))
     weight = (1 / ((1 + away) * sigma)).repeat(3)[:, None]
     by_shape = _joint_derivatives(pose.frames[0].numpy(), *derivatives)
