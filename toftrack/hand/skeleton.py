@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -66,6 +67,10 @@ CHAIN_SLOTS = (*range(5), *(5 * f + s for f in range(1, 5) for s in (0, 1, 3, 4)
 SLOT_BONES = [0, 0, 1, 1, 2]
 """The bone of a finger that each of its slots is the first to turn, about an axis through its
 proximal end: the z axis of the bone before (of the rest frame), or its own x axis."""
+_BEFORE = np.array([-1, *(4 * finger + joint for finger in range(5) for joint in range(4))])
+_FIRST = np.array([4 * (slot // 5) + SLOT_BONES[slot % 5] for slot in CHAIN_SLOTS])
+JOINT_MOVES = (_BEFORE[:, None] // 4 == _FIRST // 4) & (_BEFORE[:, None] > _FIRST)
+"""(21, 21) which angles move each joint: those that turn a bone of its finger before it."""
 
 
 class HandPose(NamedTuple):

@@ -17,6 +17,7 @@ from toftrack.hand.shape import HandShape
 from toftrack.hand.skeleton import (
     ANGLE_LIMITS,
     CHAIN_SLOTS,
+    JOINT_MOVES,
     SLOT_BONES,
     HandPose,
     forward_kinematics,
@@ -149,31 +150,22 @@ def joint_jacobian(pose: HandPose, shape: HandShape) -> Tensor:
 
     Returns (T, 60, 27), metres per metre or radian.
     """
-    joints = pose.joints_m[:, 1:].unflatten(1, (5, 4))  # (T, 5, 4, 3)
+    joints = pose.joints_m[:, 1:]
     bones = pose.frames[:, 1:].unflatten(1, (5, 3))  # (T, 5, 3, 3, 3)
     origins = pose.origins_m[:, 1:].unflatten(1, (5, 3))
     rest_z = (pose.frames[:, :1] @ shape.base_frames)[..., 2]  # (T, 5, 3)
     axes = torch.stack(
         (rest_z, bones[:, :, 0, :, 0], bones[:, :, 0, :, 2], *bones[:, :, 1:, :, 0].unbind(2)), 2
     )  # (T, 5, 5 slots, 3)
-    lever = joints[:, :, None] - origins[:, :, SLOT_BONES, None]  # (T, 5, slots, 4 joints, 3)
-    moves = torch.linalg.cross(axes[:, :, :, None].expand_as(lever), lever)
-    carried = [[joint > bone for joint in range(4)] for bone in SLOT_BONES]
-    moves = moves * moves.new_tensor(carried)[..., None]
-
-    count = len(joints)
-    jacobian = joints.new_zeros(count, 5, 4, 3, 6 + 25)
-    eye = torch.eye(3, dtype=joints.dtype, device=joints.device)
-    jacobian[..., :3] = eye
-    from_wrist = joints - pose.joints_m[:, None, :1]
-    turns = torch.linalg.cross(eye.expand(*from_wrist.shape, 3), from_wrist[..., None, :])
-    jacobian[..., 3:6] = turns.mT
-    for finger in range(5):
-        jacobian[:, finger, :, :, 6 + 5 * finger : 11 + 5 * finger] = moves[:, finger].permute(
-            0, 2, 3, 1
-        )
-    columns = (*range(6), *(6 + slot for slot in CHAIN_SLOTS))
-    return jacobian.flatten(1, 3)[..., columns]
+    slots = list(CHAIN_SLOTS)
+    through = origins[:, :, SLOT_BONES].flatten(1, 2)[:, slots]
+    lever = joints[:, :, None] - through[:, None]  # (T, 20, 21, 3)
+    moves = torch.linalg.cross(axes.flatten(1, 2)[:, None, slots].expand_as(lever), lever)
+    moves = moves * moves.new_tensor(JOINT_MOVES[1:])[..., None]
+    from_wrist = (joints - pose.joints_m[:, :1])[:, :, None]
+    eye = torch.eye(3, dtype=joints.dtype, device=joints.device).expand(*joints.shape, 3)
+    turns = torch.linalg.cross(eye, from_wrist.expand_as(eye))
+    return torch.cat((eye, turns, moves), 2).mT.flatten(1, 2)
 
 
 def _align(roots: Tensor, joints: Tensor) -> tuple[Tensor, Tensor]:

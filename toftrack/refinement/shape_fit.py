@@ -32,7 +32,7 @@ from torch import Tensor
 from toftrack.compute.rotations import rotation_matrix
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
-from toftrack.hand.skeleton import CHAIN_SLOTS, SLOT_BONES, HandPose
+from toftrack.hand.skeleton import CHAIN_SLOTS, JOINT_MOVES, SLOT_BONES, HandPose
 from toftrack.refinement.gauss_newton import KEYPOINT_SIGMAS, Keypoints
 
 _COUNT = len(COMPONENTS)
@@ -63,10 +63,6 @@ KEYPOINTS_OFF = (0.0, -0.10, 0.0, 0.0, 0.0, 0.0)
 """By how much the keypoints put the components wrong: means of uncertain places shorten fingers.
 Of rendered sequences of other hands, like what is said above."""
 _SLOTS = list(CHAIN_SLOTS)
-_BEFORE = np.array([-1, *(4 * finger + joint for finger in range(5) for joint in range(4))])
-_FIRST = np.array([4 * finger + bone for finger in range(5) for bone in SLOT_BONES])[_SLOTS]
-_JOINT_MOVES = (_BEFORE[:, None] // 4 == _FIRST // 4) & (_BEFORE[:, None] > _FIRST)
-"""(21, 21) which angles move each joint: those that turn a bone of its finger before it."""
 _KEY = np.dtype(
     [
         ("angles", "f8", 21),
@@ -300,7 +296,7 @@ def _joint_jacobian(pose: HandPose, shape: HandShape) -> np.ndarray:
     rows[:, :, :3] = np.eye(3)
     rows[:, :, 3:6] = np.cross(np.eye(3), (joints - origins[0])[:, None]).swapaxes(1, 2)
     turned = np.cross(axes, joints[:, None] - through)
-    rows[:, :, 6:] = (turned * _JOINT_MOVES[..., None]).swapaxes(1, 2)
+    rows[:, :, 6:] = (turned * JOINT_MOVES[..., None]).swapaxes(1, 2)
     return rows.reshape(63, 27)
 
 
