@@ -68,15 +68,11 @@ def in_radians(path: str | Path, angles: np.ndarray, units: str | None, say: str
         raise ToftrackError(f"{path} {what}; {say.format('degrees or radians')}")
     largest = float(np.nan_to_num(np.abs(angles)).max())
     # No joint bends by more than 2.1 rad, and no collection of hands stays within 2.1 degrees.
-    if units == "radians" and largest > 4.0:
+    if largest > 4.0 if units == "radians" else 0 < largest < 3.0:
+        other = "degrees" if units == "radians" else "radians"
         raise ToftrackError(
-            f"{path} has angles up to {largest:.1f}, but is said to be in radians, which no joint"
-            f" reaches; if they are degrees, {say.format('degrees')}"
-        )
-    if units == "degrees" and 0 < largest < 3.0:
-        raise ToftrackError(
-            f"{path} has no angle above {largest:.2f}, but is said to be in degrees, so that the"
-            f" hand would hardly move; if they are radians, {say.format('radians')}"
+            f"{path} has angles up to {largest:.2f}, which cannot be a hand's {units}; if they are"
+            f" {other}, {say.format(other)}"
         )
     return np.radians(angles) if units == "degrees" else angles
 
