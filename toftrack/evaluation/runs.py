@@ -82,14 +82,10 @@ def sources(paths: Sequence[str | Path], labels: Sequence[str | Path] = ()) -> l
         mine = [source for source in (_source(file, known) for file in files) if source]
         if not mine:
             what = f"'{path}' {'holds no recording' if path.is_dir() else 'is no recording'}"
-            if known:
-                raise ToftrackError(
-                    f"{what} whose images fit the labels in size and, for stills, in number; give"
-                    " the one that was labelled"
-                )
             raise ToftrackError(
-                f"{what} with truth (an .npz with 'joints_m'); give one that has, or labels of its "
-                "images with --labels FILE, which `toftrack label RECORDING` makes"
+                f"{what} with truth (an .npz with 'joints_m') or labels that fit its images in "
+                "size and, for stills, in number; give one that has, or labels of its images with "
+                "--labels FILE, which `toftrack label RECORDING` makes"
             )
         found += mine
     for one in known:
