@@ -119,8 +119,6 @@ def test_other_shapes_than_the_truth_are_reported(shape) -> None:
     true = hand([True] * 4)
     with pytest.raises(ToftrackError, match="compare the same joints of the same frames"):
         judged(np.zeros(shape), flags("...."), true)
-    with pytest.raises(ToftrackError, match="S at least 1"):
-        slots_of_hands(np.zeros(shape), flags("...."), [true])
 
 
 def test_the_interval_holds_the_mean() -> None:

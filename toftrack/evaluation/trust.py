@@ -160,18 +160,12 @@ def slots_of_hands(
     """The slot of each hand: one for the whole recording, so that the sum of errors is smallest; a
     swap on the way counts as error.
 
-    joints_m: (T, S, J, 3) metres, camera frame.  lost: (T, S) bool.
-    Raises ToftrackError: as `judged`, or there are no slots, or fewer than hands.
+    joints_m: (T, S, J, 3) metres, camera frame, S not below the hands.  lost: (T, S) bool.
+    Raises ToftrackError: as `judged`.
     """
     from scipy.optimize import linear_sum_assignment  # a fifth of a second, which few runs need
 
     estimate, lost = np.asarray(joints_m, np.float64), np.asarray(lost, bool)
-    fits = estimate.ndim == 4 and lost.shape == estimate.shape[:2]
-    if not fits or estimate.shape[1] < len(hands):
-        raise ToftrackError(
-            f"a track of {len(hands)} hands must have joints of the shape (T, S, J, 3) and lost of "
-            f"(T, S), S at least {len(hands)}, but they are {estimate.shape} and {lost.shape}"
-        )
     for hand in hands:
         _check(estimate[:, 0].shape, lost[:, 0].shape, hand)
     slots = range(estimate.shape[1])
