@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.frames.camera import Camera
 
 PEER = "mediapipe"
@@ -57,16 +57,11 @@ class Peer:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115  a pipe that nobody reads fills up
         # Isolated: the modules beside the script are not its own.
         command = [self.python, "-I", str(SCRIPT)]
-        try:
+        remedy = f"give the Python of an environment with {PEER}; {MAKE_ENVIRONMENT}"
+        with reported_errors(f"--peer-python {python} cannot be run", remedy):
             self._process = subprocess.Popen(
                 command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=self._errors
             )
-        except OSError as error:
-            self._errors.close()
-            raise ToftrackError(
-                f"--peer-python {python} cannot be run ({error.strerror}); give the Python of an "
-                f"environment with {PEER}; {MAKE_ENVIRONMENT}"
-            ) from None
         assert self._process.stdin is not None and self._process.stdout is not None
         self._to, self._from = self._process.stdin, self._process.stdout
         self.versions = self._greeting()
