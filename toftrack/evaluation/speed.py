@@ -58,8 +58,6 @@ _LATENTS = 10_000
 _FEWEST_FRAMES, _STARTS = 12, 6
 _BODY_M, _WALL_M = 0.9, 1.5
 """From where on the packaged recording shows the body, and where the wall is."""
-
-
 Row = dict[str, Any]
 """One line of a table, times in milliseconds; JSON-able.
 

@@ -36,8 +36,6 @@ _THUMB_TIP, _INDEX_TIP, _MIDDLE_TIP = (
     JOINT_NAMES.index(f"{finger}_tip") for finger in ("thumb", "index", "middle")
 )
 _DISTANCES = (_THUMB_TIP, _LITTLE), (_THUMB_TIP, _INDEX_TIP), (_INDEX_TIP, _MIDDLE_TIP)
-
-
 SUMS = np.zeros((REACH, len(ANGLE_NAMES)))
 """(10, 21): what is added up of the angles."""
 _EVERY_JOINT = np.ones(len(JOINT_NAMES), bool)

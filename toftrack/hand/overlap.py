@@ -23,6 +23,7 @@ RADII_MM = [
     for proximal, middle, last in BONE_RADII_MM
 ]
 """Of the points that are compared: middle joint, last joint, tip, two bones' middles."""
+_RADII_M = np.array(RADII_MM) / 1e3
 
 
 def finger_overlap(joints_m: Tensor, hand_length_m: float) -> Tensor:
@@ -80,7 +81,3 @@ def _add_overlaps(joints, ratio, out):
                 found *= 1 + (STRICT - 1) * either
                 out[n, first] += found
                 out[n, second] += found
-
-
-_RADII_M = np.array(RADII_MM) / 1e3
-"""(5, 5) radii of the points that are compared, of the mean adult."""

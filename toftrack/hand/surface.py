@@ -35,7 +35,6 @@ BONE_RADII_MM = (
     (8.6, 7.6, 6.6),
 )
 
-
 # Of the three bones of the thumb and of the other fingers, in parts of the bone's half-breadth:
 # half-depth; how far the flesh's middle lies from the axis towards the palm; by how much it goes
 # past the bone's proximal and distal end. The last bone's ends exactly at the finger's tip.

@@ -33,8 +33,6 @@ _DATA: dict[str, Callable[[], PoseData]] = {
 }
 _SAME_RAD = 1e-6
 """Poses that differ by less than this in every angle are the same."""
-
-
 _OWN = (IsomapPoseSpace, KernelPCAPoseSpace, LLEPoseSpace, PCAPoseSpace)
 KINDS: dict[str, type[PoseSpace]] = {space.kind: space for space in _OWN}
 """Every kind of toftrack's own."""

@@ -12,8 +12,6 @@ from toftrack.hand.skeleton import ANGLE_NAMES, FINGERS
 
 _GROUP = np.array([5, 5, 5, 6, 6, 6, *(FINGERS.index(name.split("_")[0]) for name in ANGLE_NAMES)])
 """Of each degree of freedom: the fingers, translation, rotation."""
-
-
 _NOISE = np.square([0.12] * 5 + [0.003, 0.03])
 """Squared noise of the refined pose of a hand that moves, of all angles of a finger together (rad),
 translation (m) and rotation (rad). Smaller changes are mostly noise."""
