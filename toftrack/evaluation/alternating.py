@@ -105,21 +105,14 @@ Runner = Callable[[], list[float]]
 """Times a program once; milliseconds of its frames. Raises ToftrackError."""
 
 
-@contextmanager
-def _in_process(program: Program) -> Iterator[Runner]:
-    """A program in a process of its own."""
-    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-
-        def once() -> list[float]:
-            try:
-                return pool.submit(_round, program).result()
-            except BrokenProcessPool:
-                raise ToftrackError(f"the process that timed {program.name!r} has ended") from None
-            except ToftrackError as error:
-                raise ToftrackError(f"{program.name}: {error}") from None
-
-        once()  # compiles, and sees everything once
-        yield once
+def _in_process(pool: ProcessPoolExecutor, program: Program) -> list[float]:
+    """Times a program in a process of its own, that of the pool."""
+    try:
+        return pool.submit(_round, program).result()
+    except BrokenProcessPool:
+        raise ToftrackError(f"the process that timed {program.name!r} has ended") from None
+    except ToftrackError as error:
+        raise ToftrackError(f"{program.name}: {error}") from None
 
 
 def _round(program: Program) -> list[float]:
@@ -172,20 +165,21 @@ def _peer(hands: int, python: str) -> Iterator[Runner]:
     images += images[-2:0:-1]
     with closing(Peer(python)) as peer:
         peer.begin(camera, "right", hands)
-
-        def once() -> list[float]:
-            return [1e3 * peer.step(*image).compute_s for image in images]
-
-        once()
-        yield once
+        yield lambda: [1e3 * peer.step(*image).compute_s for image in images]
 
 
 def timed(which: Sequence[Program], rounds: int, peer_python: str | None = None) -> list[Times]:
     """Milliseconds of frames, each program's in turn with the others'. Raises ToftrackError."""
+    spawn = multiprocessing.get_context("spawn")
     with ExitStack() as stack:
-        runners = [(Times(one.name), stack.enter_context(_in_process(one))) for one in which]
+        runners: list[tuple[Times, Runner]] = []
+        for program in which:
+            pool = stack.enter_context(ProcessPoolExecutor(1, spawn))
+            runners.append((Times(program.name), functools.partial(_in_process, pool, program)))
         for name, hands in PEER_HANDS.items() if peer_python is not None else ():
             runners.append((Times(name), stack.enter_context(_peer(hands, str(peer_python)))))
+        for _, once in runners:
+            once()  # compiles, and sees everything once
         for _ in range(rounds):
             for times, once in runners:
                 times.rounds.append(once())
