@@ -41,7 +41,7 @@ _JOINT_FRAME = np.array(JOINT_FRAME)
 _REACH = np.float32(REACH_M**2)
 _LIMITS = np.array(ANGLE_LIMITS)
 _NO_FRAMES = np.empty((0, 16, 3, 3), np.float32)
-_ORIGINS = [0, *(1 + 4 * finger + bone for finger in range(5) for bone in range(3))]
+_ORIGINS = np.array([0, *(1 + 4 * finger + bone for finger in range(5) for bone in range(3))])
 """The joints at which the frames of a hand begin."""
 _FREE = 27
 """Degrees of freedom: translation, rotation about the wrist, angles."""
@@ -81,7 +81,7 @@ def pose_ellipsoids(frames, joints, index, centres, axes, posed):
     """Rows of (12,) float32: the whitening W by rows and W c, so that q = W p - W c."""
     for e in range(len(posed)):
         frame = frames[index[e]]
-        origin = _origin(joints, index[e])
+        origin = _ORIGINS[index[e]]
         for row in range(3):
             square = axes[e, 0, row] ** 2 + axes[e, 1, row] ** 2 + axes[e, 2, row] ** 2
             shift = 0.0
@@ -93,12 +93,6 @@ def pose_ellipsoids(frames, joints, index, centres, axes, posed):
                 posed[e, 3 * row + i] = axis / square
                 shift += axis / square * centre
             posed[e, 9 + row] = shift
-
-
-@compiled
-def _origin(joints, frame):
-    """The joint at which a frame has its origin."""
-    return 0 if frame == 0 else 1 + 4 * ((frame - 1) // 3) + (frame - 1) % 3
 
 
 @compiled
@@ -203,7 +197,7 @@ def add_silhouette(seen, lengths, hand, deviation, wrenches):
     if beside.shape[0] == 0:
         return
     for frame in range(1, 16):
-        origin = _origin(joints, frame)
+        origin = _ORIGINS[frame]
         length = lengths[(frame - 1) // 3, (frame - 1) % 3]
         for part in ALONG_BONE:
             x = (
@@ -427,7 +421,7 @@ def pose_surface(state, shape, surface, centres_out, axes_out):
     frames, joints = empty((16, 3, 3), np.float64), empty((21, 3), np.float64)
     pose_hand(state, *shape, frames, joints)
     for e in range(len(index)):
-        frame, origin = frames[index[e]], _origin(joints, index[e])
+        frame, origin = frames[index[e]], _ORIGINS[index[e]]
         for i in range(3):
             centres_out[e, i] = joints[origin, i]
             for j in range(3):
