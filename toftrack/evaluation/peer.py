@@ -13,8 +13,8 @@ import subprocess
 import tempfile
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -30,22 +30,6 @@ MAKE_ENVIRONMENT = (
 _ANSWER = np.dtype(
     [("joints_m", "f8", (21, 3)), ("seconds", "f8"), ("sure", "f8"), ("right", "f8")]
 )
-
-
-@dataclass(frozen=True, eq=False)
-class PeerEstimate:
-    """What a peer says of a frame.
-
-    joints_m: (21, 3) metres, camera frame, NaN where it sees no hand.  lost: it sees none.
-    side: "right", "left", or "" without a hand.  side_probability: of that, NaN without one.
-    compute_s: wall seconds from the images to the joints, in its own process.
-    """
-
-    joints_m: np.ndarray
-    lost: bool
-    side: str
-    side_probability: float
-    compute_s: float
 
 
 class Peer:
@@ -84,8 +68,9 @@ class Peer:
         facts = {"size": size, "k": k, "side": side, "hands": hands}
         self._send(json.dumps({"begin": facts}).encode() + b"\n")
 
-    def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> PeerEstimate:
-        """What it says of a frame: (H, W) metres, 0 = no reading, and (H, W) uint16. Raises
+    def step(self, depth_m: np.ndarray, amplitude: np.ndarray) -> SimpleNamespace:
+        """What it says of a frame: (H, W) metres, 0 = no reading, and (H, W) uint16. The fields are
+        those of an Estimate; joints_m and side_probability are NaN where it sees no hand. Raises
         ToftrackError when its process has ended."""
         self._send(b'{"frame": true}\n')
         self._send(np.ascontiguousarray(amplitude, np.uint16).tobytes())
@@ -96,8 +81,13 @@ class Peer:
         row = np.frombuffer(answer, _ANSWER)[0]
         lost = not bool(np.isfinite(row["joints_m"]).all())
         side = "" if lost else ("right" if row["right"] else "left")
-        sure, seconds = float(row["sure"]), float(row["seconds"])
-        return PeerEstimate(row["joints_m"].astype(np.float32), lost, side, sure, seconds)
+        return SimpleNamespace(
+            joints_m=row["joints_m"].astype(np.float32),
+            lost=lost,
+            side=side,
+            side_probability=float(row["sure"]),
+            compute_s=float(row["seconds"]),
+        )
 
     def _greeting(self) -> Mapping[str, Any]:
         line = self._from.readline()

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from toftrack.api import make_tracker
 from toftrack.evaluation.datasets import FPS, DataSet, LabelledSequence
 from toftrack.evaluation.results import plain, table_of
-from toftrack.evaluation.runs import estimates_of, kept
+from toftrack.evaluation.runs import Reported, estimates_of, kept
 from toftrack.evaluation.statistics import figure, interval, mean_of, share_pct
 from toftrack.evaluation.trust import OK_MM, TIPS, judged, tips_inset, trust
 from toftrack.frames.frame import Truth
@@ -59,10 +59,10 @@ def evaluate(
                 note = f"{sequence.left_out} labels have no image and are left out"
                 bar.write(f"note: {sequence.name}: {note}", file=sys.stderr)
             tracker = make_tracker(f"hand.side={sequence.side}", *overrides)
-            reported = []
+            reported: Reported = []
             for index in range(count):
                 depth_m, time_s = sequence.frame(index), index / FPS
-                reported.append([kept(tracker.step(depth_m, sequence.camera.K, index, time_s))])
+                reported.append((kept(tracker.step(depth_m, sequence.camera.K, index, time_s)),))
                 bar.update()
             found = estimates_of(reported)
             joints = tips_inset(found.joints_m, tip_inset_m)[:, list(data_set.joints)]

@@ -25,7 +25,7 @@ from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.image_labels import Points, Stills, point_rows, read_labels, still_row
 from toftrack.evaluation.measures import Estimates, measured
-from toftrack.evaluation.peer import PEER, PeerEstimate, peer_process
+from toftrack.evaluation.peer import PEER, peer_process
 from toftrack.evaluation.rows import Row, group_counts, row_figures
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
@@ -34,6 +34,8 @@ from toftrack.tracking.model import FilterModel
 from toftrack.tracking.tracker import HandsTracker
 
 SIDES = ("told", "auto")
+Reported = list[tuple[SimpleNamespace, ...]]
+"""What was said of each frame in each slot."""
 _FIELDS = ("joints_m", "lost", "joint_sigma_m", "joint_ok", "gesture")
 """What estimates are measured by; a peer's have the first two alone."""
 _SIDE_FIELDS = ("side", "side_probability")
@@ -212,16 +214,11 @@ def _true_rows(job: Job, device: Replay) -> list[Row]:
     reported, others = _tracked(device, job, truth.side)
     rows = [_row(job, device, truth, reported)]
     if others:
-        rows.append({"method": PEER, **_row(job, device, truth, [(one,) for one in others])})
+        rows.append({"method": PEER, **_row(job, device, truth, others)})
     return rows
 
 
-def _row(
-    job: Job,
-    device: Replay,
-    truth: Truth,
-    reported: Sequence[Sequence[SimpleNamespace | PeerEstimate]],
-) -> Row:
+def _row(job: Job, device: Replay, truth: Truth, reported: Reported) -> Row:
     track = estimates_of(reported, with_side=job.side == "auto")
     compute_s = np.array([frame[0].compute_s for frame in reported])
     found = measured(track, truth)
@@ -240,23 +237,21 @@ def _row(
     }
 
 
-def _tracked(
-    device: Replay, job: Job, side: str
-) -> tuple[list[tuple[SimpleNamespace, ...]], list[PeerEstimate]]:
+def _tracked(device: Replay, job: Job, side: str) -> tuple[Reported, Reported]:
     """What the tracker says of each frame, and what the peer, if there is one, says after it."""
     peer = None if job.peer is None else peer_process(job.peer)
     if peer is not None:
         peer.begin(device.camera, side if job.side == "told" else "")
     tracker = _tracker(job, side)
-    reported: list[tuple[SimpleNamespace, ...]] = []
-    others: list[PeerEstimate] = []
+    reported: Reported = []
+    others: Reported = []
     for frame in device:
         depth = device.camera.rectify(frame.depth, frame.radial)
         said = tracker.step(depth, device.camera.K, frame.index, frame.timestamp_s)
         reported.append(tuple(map(kept, said)))
         if peer is not None:
             assert frame.amplitude is not None
-            others.append(peer.step(depth, frame.amplitude))
+            others.append((peer.step(depth, frame.amplitude),))
     return reported, others
 
 
@@ -266,9 +261,7 @@ def kept(estimate: Estimate) -> SimpleNamespace:
     return SimpleNamespace(**{name: getattr(estimate, name) for name in names})
 
 
-def estimates_of(
-    reported: Sequence[Sequence[SimpleNamespace | PeerEstimate]], with_side: bool = False
-) -> Estimates:
+def estimates_of(reported: Reported, with_side: bool = False) -> Estimates:
     """What was said in T frames of each slot, by those fields of Estimates that the reported ones
     have, with the side where it was found out; with one slot without its axis."""
     names = (*_FIELDS, *(_SIDE_FIELDS if with_side else ()))
