@@ -100,26 +100,19 @@ def result_of(rows: Sequence[Row]) -> dict[str, Any]:
 def read_rows(path: Path) -> list[Row]:
     """The rows of an earlier measurement; ToftrackError where the file is none."""
     what = f"--compare '{path}' is no file that toftrack benchmark accuracy --json wrote"
-    with reported_errors(what, "give such a file", OSError, ValueError):
+    damaged = OSError, ValueError, KeyError, TypeError
+    with reported_errors(what, "give such a file", *damaged):
         content = read_json(path)
-        rows = content.get("rows") if isinstance(content, dict) else None
-        if not isinstance(rows, list) or not rows:
+        if not isinstance(content, dict) or not content.get("rows"):
             raise ValueError("it has no 'rows'")
+        rows: list[Row] = content["rows"]
         for row in rows:
-            _check_row(row)
+            name, seed = row["recording"], row["seed"]
+            figures = [row[key] for key in COMPARED if row.get(key) is not None]
+            numbers = all(isinstance(one, int | float) and math.isfinite(one) for one in figures)
+            if not (numbers and isinstance(name, str) and type(seed) is int):
+                raise ValueError(f"its row of {name!r} is damaged")
     return rows
-
-
-def _check_row(row: Any) -> None:
-    if not isinstance(row, dict) or not isinstance(row.get("recording"), str):
-        raise ValueError("its 'rows' do not name recordings")
-    if type(row.get("seed")) is not int:
-        raise ValueError(f"its row of '{row['recording']}' has no seed")
-    for key in COMPARED:
-        value = row.get(key)
-        number = isinstance(value, int | float) and math.isfinite(value)
-        if value is not None and not number:
-            raise ValueError(f"'{key}' of '{row['recording']}' is no number")
 
 
 def checked_targets(*paths: Path | None) -> None:
