@@ -54,12 +54,9 @@ def leap_data(path: str, poses: int | None, worst_fit_mm: float) -> PoseData:
     shape = default_hand_shape().to(torch.float64)
     directions = torch.stack([straight_finger_directions(clips[i], shape) for i in kept]).sum(0)
     yaw = math.atan2(float(directions[0]), float(directions[1]))
-    try:
+    what = f"the joint positions of {path} do not make a hand"
+    with reported_errors(what, "are they in millimetres?", torch.linalg.LinAlgError):
         fits = [fit_angles(clips[i], shape_of_joints(clips[i], shape, yaw)) for i in kept]
-    except torch.linalg.LinAlgError:
-        raise ToftrackError(
-            f"the joint positions of {path} do not make a hand; are they in millimetres?"
-        ) from None
     angles = torch.cat([fit.angles_rad for fit in fits])
     error_mm = 1e3 * torch.cat([fit.error_m for fit in fits])
     followed = error_mm.mean(1) <= worst_fit_mm
