@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from toftrack.errors import ToftrackError
-from toftrack.hand import make_hand_shape
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
 from toftrack.hand.surface import hand_surface
@@ -98,7 +97,7 @@ def test_a_shape_file_round_trips_and_says_how_the_shape_was_fitted(tmp_path) ->
     fitted = Fitted(("length", "thumb"), (-0.1, 0.02), ((4e-4, 1e-5), (1e-5, 9e-4)), 7.5, True)
     shape = dataclasses.replace(default_hand_shape(0.18, "left"), thickness=1.1, fitted=fitted)
     shape.save(path)
-    loaded = make_hand_shape(str(path), side="left")
+    loaded = HandShape.load(path).of_side("left")
     torch.testing.assert_close(loaded.base_m, shape.base_m)
     torch.testing.assert_close(loaded.bone_lengths_m, shape.bone_lengths_m)
     torch.testing.assert_close(loaded.base_frames, shape.base_frames)
@@ -108,7 +107,7 @@ def test_a_shape_file_round_trips_and_says_how_the_shape_was_fitted(tmp_path) ->
     for damage in ({"components": 3}, {"poses": "many"}, {"covariance": [[1]]}):
         path.write_text(json.dumps({**content, "fitted": {**content["fitted"], **damage}}))
         with pytest.raises(ToftrackError, match="damaged"):
-            make_hand_shape(str(path))
+            HandShape.load(path)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +125,7 @@ def test_a_bad_shape_file_is_one_clear_error(tmp_path, content, part) -> None:
     if content is not None:
         path.write_text(content)
     with pytest.raises(ToftrackError, match=part):
-        make_hand_shape(str(path))
+        HandShape.load(path)
 
 
 def test_an_unknown_side_or_an_impossible_length_is_refused() -> None:

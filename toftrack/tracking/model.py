@@ -18,8 +18,7 @@ from toftrack.compute.rigid import bound
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.frames.estimate import no_estimate
 from toftrack.gestures.recognition import Gestures
-from toftrack.hand import make_hand_shape
-from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace
 from toftrack.refinement.gauss_newton import Refinement
@@ -50,11 +49,17 @@ class Hand:
 
 
 def make_hand(shape: str, side: str, length_m: float) -> Hand:
-    """The configured hand of arguments as in toftrack.hand.make_hand_shape, which says the errors.
+    """The configured hand: the mean adult's scaled to a length, or one read from a file.
 
-    Only shape="auto" is fitted; only side="auto" is detected, and begins as a right hand.
+    shape: "default"; "auto", the same as a guess that is fitted; or the path of a hand-shape file.
+    side: "auto" is detected, and begins as a right hand.
+    Raises ToftrackError for an unknown side, an impossible length or an unreadable file.
     """
-    made = make_hand_shape(shape, "right" if side == "auto" else side, length_m)
+    known = "right" if side == "auto" else side
+    if shape in ("default", "auto"):
+        made = default_hand_shape(length_m, known)
+    else:
+        made = HandShape.load(shape).of_side(known)
     return Hand(made, shape == "auto", side != "auto")
 
 
