@@ -45,6 +45,7 @@ INTEL_CREATIVE = Camera(np.array([[241.42, 0, 160], [0, 241.42, 120], [0, 0, 1]]
 """The camera of MSRA and ICVL."""
 NYU_CAMERA = Camera(np.array([[588.036865, 0, 320], [0, 587.075073, 240], [0, 0, 1]]), 640, 480)
 _MILLIMETRE = 1e-3
+_REMEDY = "copy the data set again"
 _MAX_M = 10.0
 """Larger readings stand for none."""
 
@@ -118,7 +119,7 @@ def _of_images(labelled: LabelledSequence) -> LabelledSequence:
 
 
 def _unusable(what: str) -> ToftrackError:
-    return ToftrackError(f"{what}; copy the data set again")
+    return ToftrackError(f"{what}; {_REMEDY}")
 
 
 def _metres(millimetres: np.ndarray) -> np.ndarray:
@@ -127,18 +128,11 @@ def _metres(millimetres: np.ndarray) -> np.ndarray:
     return np.where((depth > 0) & (depth < _MAX_M), depth, np.float32(0))
 
 
-def _bytes(path: Path) -> bytes:
-    with reported_errors(f"the file '{path}' cannot be read", "copy the data set again"):
-        with open_to_read(path) as stream:
-            return stream.read()
-
-
 def _lines(path: Path) -> list[str]:
     """Those that are not empty."""
-    try:
-        text = _bytes(path).decode("ascii")
-    except UnicodeDecodeError:
-        raise _unusable(f"the file '{path}' is damaged: it is no text") from None
+    with reported_errors(f"the file '{path}' cannot be read as text", _REMEDY, OSError, ValueError):
+        with open_to_read(path) as stream:
+            text = stream.read().decode("ascii")
     return [line for line in text.splitlines() if line.strip()]
 
 
@@ -194,25 +188,22 @@ def _msra_sequence(folder: Path, name: str) -> LabelledSequence:
 def _msra_depth(path: Path) -> np.ndarray:
     """(240, 320) float32 metres; what lies outside of the stored box is no reading."""
     width, height = INTEL_CREATIVE.width, INTEL_CREATIVE.height
-    content = _bytes(path)
     left, top, right, bottom, start = 0, 0, width, height, 0
-    if len(content) != 4 * width * height:
-        start = 4 * _HEADER
-        header = np.frombuffer(content[:start], "<i4") if len(content) >= start else ()
-        if tuple(header[:2]) != (width, height):
-            raise _no_image(path)
-        left, top, right, bottom = map(int, header[2:])
-        inside = 0 <= left <= right <= width and 0 <= top <= bottom <= height
-        if not inside or len(content) != start + 4 * (right - left) * (bottom - top):
-            raise _no_image(path)
+    what = f"the image '{path}' is damaged, or cannot be read"
+    with reported_errors(what, _REMEDY, OSError, ValueError):
+        with open_to_read(path) as stream:
+            content = stream.read()
+        if len(content) != 4 * width * height:
+            start = 4 * _HEADER
+            *size, left, top, right, bottom = np.frombuffer(content, "<i4", _HEADER).tolist()
+            inside = 0 <= left <= right <= width and 0 <= top <= bottom <= height
+            whole = len(content) == start + 4 * (right - left) * (bottom - top)
+            if not (size == [width, height] and inside and whole):
+                raise ValueError("it is no depth image of 320x240 pixels")
     values = np.frombuffer(content, "<f4", offset=start).reshape(bottom - top, right - left)
     depth = np.zeros((height, width), np.float32)
     depth[top:bottom, left:right] = _metres(values)
     return depth
-
-
-def _no_image(path: Path) -> ToftrackError:
-    return _unusable(f"the image '{path}' is damaged: it is no depth image of 320x240 pixels")
 
 
 # ICVL
@@ -289,8 +280,7 @@ def _nyu_sequences(folder: Path) -> list[LabelledSequence]:
 def _nyu_labels(path: Path) -> np.ndarray:
     """(T, 12, 3) metres, camera frame: the wrist, then the fingers' points in toftrack's order."""
     what = f"{_NYU_KEY} in the file '{path}'"
-    used, remedy = f"the file '{path}' cannot be used", "copy the data set again"
-    with reported_errors(used, remedy, OSError, ValueError):
+    with reported_errors(f"the file '{path}' cannot be used", _REMEDY, OSError, ValueError):
         points = read_matlab(path, _NYU_KEY)
     if points.ndim != 4 or points.shape[2:] != (36, 3) or not points.size:
         raise _unusable(f"{what} has the shape {points.shape}, not (3, T, 36, 3)")
