@@ -14,7 +14,7 @@ from toftrack.api import build_hands_tracker
 from toftrack.compute.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
 from toftrack.compute.threads import at_most, threads
 from toftrack.errors import ToftrackError
-from toftrack.tracking.shape_fit import first_shape
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.tracking.tracker import Tracker
 
 BUDGET_S = 0.033

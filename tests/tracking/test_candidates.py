@@ -31,6 +31,7 @@ from toftrack.detector.parts import (
     Parts,
 )
 from toftrack.hand.shape import default_hand_shape
+from toftrack.refinement.shape_fit import first_shape, with_network_length
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.candidates import (
     _MARGIN,
@@ -45,7 +46,6 @@ from toftrack.tracking.candidates import (
     without_things,
 )
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.shape_fit import first_shape, with_network_length
 from toftrack.tracking.state import SideEvidence
 from toftrack.tracking.step import step
 

@@ -17,6 +17,7 @@ from toftrack.detector.network import PARTS
 from toftrack.detector.parts import FOREARM_PART, Parts
 from toftrack.detector.proposals import Places
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
+from toftrack.refinement.shape_fit import first_shape, with_network_length
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.detect import (
     PendingDetections,
@@ -25,7 +26,6 @@ from toftrack.tracking.detect import (
     start_detection,
 )
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.shape_fit import first_shape, with_network_length
 from toftrack.tracking.state import SideEvidence, Track
 from toftrack.tracking.step import step
 

@@ -12,10 +12,10 @@ from omegaconf import OmegaConf
 from toftrack.compute.rigid import MOTIONS, rotated_pivot
 from toftrack.errors import ToftrackError
 from toftrack.hand.skeleton import JOINT_NAMES
+from toftrack.refinement.shape_fit import first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.model import FilterModel
 from toftrack.tracking.paper import PaperModel, RoughStart, ScoreThreshold, palm_centre
-from toftrack.tracking.shape_fit import first_shape
 from toftrack.tracking.state import Track
 
 PALM = [JOINT_NAMES.index(name) for name in ("wrist", "index_mcp", "middle_mcp", "little_mcp")]

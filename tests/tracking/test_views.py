@@ -22,10 +22,10 @@ from toftrack.compute.pace import Duration
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.frames.frame import DepthImage
 from toftrack.hand.shape import default_hand_shape
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, with_network_length
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.candidates import View
 from toftrack.tracking.model import TrackerModel
-from toftrack.tracking.shape_fit import ShapeEstimate, first_shape, with_network_length
 from toftrack.tracking.sides import changes_side, side_log_odds
 from toftrack.tracking.state import SideEvidence, Slot, Track
 from toftrack.tracking.views import (

@@ -23,13 +23,13 @@ from toftrack.hand.shape_space import shape_derivatives, shaped
 from toftrack.pose_space.base import PoseSpace
 from toftrack.refinement.gauss_newton import Refinement
 from toftrack.refinement.gauss_newton_numba import Refiner
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.likelihood import Likelihood
 from toftrack.render.scoring import Evidence, Scorer
 from toftrack.render.segmentation import NearestSurface, Observation
 from toftrack.tracking.backend import Backend
 from toftrack.tracking.confidence import ConfidenceModel
 from toftrack.tracking.posterior import PosteriorWeights
-from toftrack.tracking.shape_fit import ShapeEstimate, first_shape
 from toftrack.tracking.state import OTHER_SIDE, Slot, TrackerState, changed
 
 _MODEL_ERROR = Spread(0.002, 0.002, 0.015, 0.015)

@@ -18,9 +18,9 @@ from toftrack.detector.proposals import Places
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import DepthImage
 from toftrack.gestures.recognition import GestureState
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Observation
 from toftrack.tracking.confidence import JOINT_FEATURES, NO_FEATURES, ConfidenceFeatures
-from toftrack.tracking.shape_fit import ShapeEstimate, first_shape
 
 OTHER_SIDE = {"right": "left", "left": "right"}
 

@@ -11,8 +11,8 @@ from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.compute.threads import small_operations
 from toftrack.detector.flying_pixels import without_flying_pixels
 from toftrack.frames.frame import DepthImage
+from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
-from toftrack.tracking import shape_fit
 from toftrack.tracking.association import associate, keep_tracks
 from toftrack.tracking.candidates import View, propose, select, with_parts
 from toftrack.tracking.confidence import confidence_features, judge

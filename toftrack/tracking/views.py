@@ -10,14 +10,14 @@ import torch
 from toftrack.compute.pace import Duration
 from toftrack.detector.detection import NO_DETECTION, Detection
 from toftrack.detector.proposals import SAME_PLACE_M
+from toftrack.refinement import shape_fit
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape
 from toftrack.render.segmentation import Expected
-from toftrack.tracking import shape_fit
 from toftrack.tracking.association import SideDetection
 from toftrack.tracking.candidates import View, best_start, with_parts, without_things
 from toftrack.tracking.filter import new_track
 from toftrack.tracking.model import TrackerModel
 from toftrack.tracking.scene import Scene
-from toftrack.tracking.shape_fit import ShapeEstimate, first_shape
 from toftrack.tracking.sides import changes_side, compare_sides, side_log_odds
 from toftrack.tracking.state import OTHER_SIDE, ParticleSet, Track, TrackerState, changed
 

@@ -24,12 +24,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from torch import Tensor
 
 from toftrack.compute.rotations import rotation_matrix
-from toftrack.detector.detection import Detection
 from toftrack.hand.shape import Fitted, HandShape
 from toftrack.hand.shape_space import COMPONENTS, POPULATION_SIGMA
 from toftrack.hand.skeleton import CHAIN_SLOTS, JOINT_MOVES, SLOT_BONES, HandPose
@@ -82,6 +82,20 @@ _LEAST = 0.02
 _STEP, _STEP_SIGMAS = 0.01, 0.5
 """Change of a component for which another hand is made, which costs some milliseconds: at least so
 much, and so many of its standard deviations."""
+
+
+class SeenHand(Protocol):
+    """What the pose network says of a hand: its joints, its length, and how probably there is one;
+    see detector/detection.py."""
+
+    @property
+    def keypoints(self) -> Keypoints: ...
+
+    @property
+    def length_m(self) -> float: ...
+
+    @property
+    def present(self) -> float: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,14 +155,14 @@ def with_network_length(
     return replace(estimate, mean=mean, applied=(applied, *estimate.applied[1:]))
 
 
-def weight_of(detection: Detection) -> float:
+def weight_of(detection: SeenHand) -> float:
     """How much a detection of the hand counts, at most 1."""
     sigma = float(np.sqrt(np.square(detection.keypoints.sigma_m.numpy()).mean()))
     weight = min(1.0, (_SURE_M / max(sigma, 1e-6)) ** 4)
     return weight if math.isfinite(weight) else 0.0
 
 
-def contradicted(estimate: ShapeEstimate, detection: Detection, first: HandShape) -> ShapeEstimate:
+def contradicted(estimate: ShapeEstimate, detection: SeenHand, first: HandShape) -> ShapeEstimate:
     """The estimate after one more frame, believed or not; begun anew where detections disagree."""
     frames = estimate.frames + 1
     if not estimate.poses or frames % EVERY:
@@ -171,7 +185,7 @@ def learned(
     state: Tensor,
     shape: HandShape,
     derivatives: tuple[np.ndarray, np.ndarray],
-    detection: Detection,
+    detection: SeenHand,
     keypoints: Keypoints,
     first: HandShape,
     posed: Callable[[Tensor], HandPose],

@@ -15,9 +15,9 @@ from toftrack.detector.detection import Detection
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape, default_hand_shape
 from toftrack.hand.shape_space import POPULATION_SIGMA, shape_derivatives, shaped
 from toftrack.hand.skeleton import forward_kinematics
+from toftrack.refinement import shape_fit
 from toftrack.refinement.gauss_newton import Keypoints
-from toftrack.tracking import shape_fit
-from toftrack.tracking.shape_fit import ShapeEstimate, first_shape, keypoints_system
+from toftrack.refinement.shape_fit import ShapeEstimate, first_shape, keypoints_system
 
 KEYPOINTS_OFF = torch.tensor(shape_fit.KEYPOINTS_OFF)
 BETWEEN_FINGERS = torch.tensor([0.05, 0.06, 0.0, 0.0, -0.05, 0.04])
