@@ -19,10 +19,10 @@ from toftrack.detector.crops import (
     WIDE_F_PX,
     WIDE_LARGEST_PX,
     WIDE_MULTIPLE,
+    WIDE_RANGE_M,
     crop_at,
     crop_rotation,
     wide,
-    wide_channels,
 )
 from toftrack.detector.detection import Detection, doubted_sigma_m
 from toftrack.detector.hand_detector import HandDetector
@@ -156,12 +156,12 @@ def test_the_whole_image_keeps_its_rays() -> None:
 
 
 @pytest.mark.parametrize("height", [48, 50])
-def test_the_whole_image_is_seen_as_in_training_and_nothing_beyond_it(height: int) -> None:
+def test_nothing_is_seen_beyond_the_whole_image(height: int) -> None:
     depth = np.random.default_rng(0).uniform(-1.0, 2.0, (height, 80)).astype(np.float32)
     image, new_k = wide(depth, k := intrinsics(WIDE_F_PX, height, 80))
-    beyond = (0, 0, 0, -height % WIDE_MULTIPLE)
-    expected = wide_channels(torch.nn.functional.pad(torch.from_numpy(depth)[None], beyond))
-    assert torch.equal(image, expected) and np.array_equal(new_k, k)
+    padded = np.pad(depth, ((0, -height % WIDE_MULTIPLE), (0, 0)))
+    far = np.where(padded > 0, np.minimum(padded / np.float32(WIDE_RANGE_M), 1), 1)
+    assert np.array_equal(image[0], (far, padded > 0)) and np.array_equal(new_k, k)
 
 
 def test_a_view_as_wide_as_the_sky_is_seen_small() -> None:

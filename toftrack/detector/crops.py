@@ -36,7 +36,14 @@ def crop_rotation(centre_m: np.ndarray, up: np.ndarray | None = None) -> np.ndar
 
     up: (3,) direction whose part across the z axis is up (-y) in the crop; None: the camera's up.
     """
-    upright = _shortest_rotation(centre_m)
+    x, y, z = map(float, centre_m)
+    distance = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    x, y, z = x / distance, y / distance, z / distance
+    # The shortest one; straight back there is none.
+    part = 1 / max(1 + z, 1e-12)
+    upright = np.array(
+        [[1 - x * x * part, -x * y * part, x], [-x * y * part, 1 - y * y * part, y], [-x, -y, z]]
+    )
     if up is None:
         return upright
     across, down, _ = up @ upright
@@ -46,22 +53,11 @@ def crop_rotation(centre_m: np.ndarray, up: np.ndarray | None = None) -> np.ndar
     return upright @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
-def _shortest_rotation(centre_m: np.ndarray) -> np.ndarray:
-    x, y, z = map(float, centre_m)
-    distance = max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    x, y, z = x / distance, y / distance, z / distance
-    # The shortest one; straight back there is none.
-    part = 1 / max(1 + z, 1e-12)
-    return np.array(
-        [[1 - x * x * part, -x * y * part, x], [-x * y * part, 1 - y * y * part, y], [-x, -y, z]]
-    )
-
-
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _LEAST_SLOPE = np.float32(0.05)
 _WIDE_RANGE = float(np.float32(WIDE_RANGE_M))
 """In double precision: a kernel multiplies by the reciprocal, and only so the rounded quotient is
-the one that torch finds in training."""
+that of single precision."""
 
 
 @shared_entry_point
@@ -182,8 +178,8 @@ def _wide_grid(size: tuple[int, int], entries: bytes) -> tuple[np.ndarray, np.nd
 
 @entry_point
 def _read_wide(depth, rows, columns, image):
-    """The readings at rows (h,) and columns (w,) into `image` (2, h, w), see wide_channels; none
-    beyond the last row or column.
+    """The readings at rows (h,) and columns (w,) into `image` (2, h, w): depth in parts of the
+    range, 1 where none; validity. There is none beyond the last row or column.
     """
     height, last = depth.shape[0], depth.shape[1] - 1
     for v in range(len(rows)):
@@ -194,10 +190,3 @@ def _read_wide(depth, rows, columns, image):
             read = inside & (z > _ZERO)
             image[0, v, u] = min(z / _WIDE_RANGE, 1.0) if read else _ONE
             image[1, v, u] = _ONE if read else _ZERO
-
-
-def wide_channels(read_m: Tensor) -> Tensor:
-    """(N, h, w) readings to (N, 2, h, w): depth in parts of the range, 1 where none; validity."""
-    valid = read_m > 0
-    far = torch.where(valid, (read_m / WIDE_RANGE_M).clamp(max=1), torch.ones_like(read_m))
-    return torch.stack((far, valid.to(read_m.dtype)), 1)

@@ -6,10 +6,11 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide_channels
+from toftrack.detector.crops import CROP, CROP_M, WIDE_F_PX, wide
 from toftrack.detector.network import SEGMENTS, STRIDE
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.training.dice import Dice
@@ -59,6 +60,8 @@ _DIRECTION = 0.15, 0.8
 pose is right, and where it is wrong, which turns crops by half a right angle."""
 WIDE_SIZE = (80, 96)
 """Rows and columns of the finder's training images."""
+_WIDE_K = np.diag((WIDE_F_PX, WIDE_F_PX, 1.0))
+"""Of which every pixel is read; no matter where the centre is."""
 _ELSEWHERE = 0.30
 """Crops about something else than a hand."""
 _EMPTY = 0.25
@@ -201,19 +204,19 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     """n whole images, a quarter of them without a raised hand."""
     dice = Dice(generator)
     height, width = WIDE_SIZE
-    wide = dice.uniform(n, low=60, high=width).round()
-    high = (wide * dice.uniform(n, low=0.70, high=0.95)).round().clamp(max=height)
+    columns = dice.uniform(n, low=60, high=width).round()
+    rows = (columns * dice.uniform(n, low=0.70, high=0.95)).round().clamp(max=height)
     lens = Lens(
         torch.full((n,), WIDE_F_PX),
-        (wide - 1) / 2 + 2.0 * dice.normal(n),
-        (high - 1) / 2 + 2.0 * dice.normal(n),
-        wide,
-        high,
+        (columns - 1) / 2 + 2.0 * dice.normal(n),
+        (rows - 1) / 2 + 2.0 * dice.normal(n),
+        columns,
+        rows,
     )
     z = dice.uniform(n, low=math.log(0.25), high=math.log(1.15)).exp()
     anywhere = dice.uniform(n, 2, low=-0.05, high=1.05)
     at = torch.where(dice.chance(_MIDDLE, n, 1), 0.5 + 0.2 * dice.normal(n, 2), anywhere)
-    u, v = wide * at[:, 0], high * at[:, 1]
+    u, v = columns * at[:, 0], rows * at[:, 1]
     pivot = torch.stack(((u - lens.cx) / WIDE_F_PX * z, (v - lens.cy) / WIDE_F_PX * z, z), 1)
     left = dice.chance(0.5, n)
     views = random_views(n, dice)
@@ -242,7 +245,7 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
         part = ((shown == label) & (depth > 0)).sum((1, 2)) / expected
         seen.append(torch.where(exists, part, torch.zeros(n)))
     return WideImages(
-        image=wide_channels(depth),
+        image=torch.cat([wide(one, _WIDE_K)[0] for one in depth.numpy()]),
         cell=torch.stack(cells, 1),
         depth_m=torch.stack((hands.pivot_m[:, 2], other.pivot_m[:, 2]), 1),
         seen=torch.stack(seen, 1),
