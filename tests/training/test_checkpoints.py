@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import save_weights
+from toftrack.detector.weights import go_on_from, save_weights
 from toftrack.errors import ToftrackError
-from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from, save
+from toftrack.training.checkpoints import Checkpoints, Progress, save
 
 
 def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
@@ -38,9 +38,9 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
 def test_training_goes_on_from_the_weights_of_a_file(tmp_path: Path) -> None:
     network, going_on, file = PoseNet(4), PoseNet(4), tmp_path / "weights.npz"
     save_weights(file, network, Finder(8), {})
-    go_on_from(file, "pose", going_on, 4)
+    go_on_from(file, going_on)
     for name, value in network.state_dict().items():
         torch.testing.assert_close(going_on.state_dict()[name], value, atol=1e-3, rtol=1e-3)
     for width in (6, 10):
         with pytest.raises(ToftrackError, match=f"width of 8, and the width to train is {width}"):
-            go_on_from(file, "finder", Finder(width), width)
+            go_on_from(file, Finder(width))

@@ -108,9 +108,11 @@ class PoseNet(nn.Module):
     anchors: Tensor
     limits: Tensor
     cells: Tensor
+    name = "pose"
 
     def __init__(self, width: int = 24) -> None:
         super().__init__()
+        self.width = width
         w1, w2, w3, w4 = width, 2 * width, 4 * width, 6 * width
         self.stem = nn.Sequential(
             nn.Conv2d(CROP_CHANNELS, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
@@ -229,8 +231,11 @@ class Finder(nn.Module):
     networks for object detection", CVPR 2017).
     """
 
+    name = "finder"
+
     def __init__(self, width: int = 32) -> None:
         super().__init__()
+        self.width = width
         w1, w2 = width, 2 * width
         self.fine = nn.Sequential(
             nn.Conv2d(2, 16, 5, 2, 2, bias=False),

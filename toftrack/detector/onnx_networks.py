@@ -21,7 +21,7 @@ from torch import Tensor
 
 from toftrack.detector.network import CELLS, JOINTS, REPORTED, SEGMENTS, Finder, Found, PoseNet
 from toftrack.detector.weights import load_weights, read_metadata, weights_file
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_to_read
 
 FORMAT = "toftrack-detector-network"
@@ -134,20 +134,15 @@ def read_session(file: Path, weights: Path) -> Any:
 
     Raises ToftrackError for one that is damaged.
     """
-    try:
-        with open_to_read(file) as stream:
-            content = stream.read(_LARGEST_BYTES + 1)
-    except FileNotFoundError:
+    if not file.exists():
         return None
-    except OSError as error:
-        raise ToftrackError(f"{file} cannot be read ({error}); {_anew(weights)}") from None
+    with reported_errors(f"{file} cannot be read", _anew(weights)), open_to_read(file) as stream:
+        content = stream.read(_LARGEST_BYTES + 1)
     if len(content) > _LARGEST_BYTES or content[-DIGEST:] != digest(content[:-DIGEST]):
         raise ToftrackError(f"{file} is damaged, its checksum is wrong; {_anew(weights)}")
-    try:
+    # ONNX Runtime's errors have no class of their own.
+    with reported_errors(f"ONNX Runtime refuses {file}", _anew(weights), Exception):
         return open_session(content)
-    except Exception as error:  # ONNX Runtime's have no class of their own
-        reason = str(error).partition("\n")[0]
-        raise ToftrackError(f"ONNX Runtime refuses {file} ({reason}); {_anew(weights)}") from None
 
 
 def open_session(content: bytes) -> Any:

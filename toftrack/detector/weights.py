@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.detector.network import Finder, PoseNet, Residual
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
 
@@ -31,18 +31,16 @@ _AGAIN = "give other detector.weights, train with python -m toftrack.training tr
 def save_weights(path: Path, pose: PoseNet, finder: Finder, about: dict[str, Any]) -> None:
     """Write both networks; `about` says how they were trained."""
     arrays: dict[str, np.ndarray] = {}
-    for name, network in (("pose", pose), ("finder", finder)):
+    for network in (pose, finder):
         for key, tensor in network.state_dict().items():
-            array = tensor.detach().cpu().numpy()
-            if array.dtype.kind == "f":
-                array = array.astype(np.float16)
-            arrays[f"{name}.{key}"] = array
+            kept = tensor.half() if tensor.is_floating_point() else tensor
+            arrays[f"{network.name}.{key}"] = kept.cpu().numpy()
     metadata = {
         "format": FORMAT,
         "version": VERSION,
         "sha256": checksum(arrays),
-        "pose_width": pose.stem[0].out_channels,
-        "finder_width": finder.heads.in_channels,
+        "pose_width": pose.width,
+        "finder_width": finder.width,
         "about": about,
     }
     write_archive(path, {"metadata": json.dumps(metadata), **arrays})
@@ -63,15 +61,30 @@ def load_weights(path: str | Path | None = None) -> Weights:
     Raises ToftrackError when the file is missing, damaged, not weights or of another version.
     """
     path = weights_file(path)
-    arrays, metadata = read_arrays(path)
-    with other_networks_refused(path):
-        pose = PoseNet(network_width(metadata, "pose"))
-        finder = Finder(network_width(metadata, "finder"))
-        for name, network in (("pose", pose), ("finder", finder)):
-            network.load_state_dict(network_tensors(arrays, name))
-    make_ready(pose)
-    make_ready(finder)
+    arrays, metadata = _read_whole(path)
+    with _other_networks_refused(path):
+        pose, finder = PoseNet(_width(metadata, "pose")), Finder(_width(metadata, "finder"))
+        for network in (pose, finder):
+            _fill(network, arrays)
+            make_ready(network)
     return Weights(pose, finder, metadata.get("about", {}), metadata["sha256"])
+
+
+def go_on_from(path: str | Path, network: PoseNet | Finder) -> str:
+    """Give a new network the weights of a file to train on from; returns its arrays' checksum.
+
+    Raises ToftrackError as load_weights does, and for weights of another width.
+    """
+    path = Path(path)
+    arrays, metadata = _read_whole(path)
+    with _other_networks_refused(path):
+        if (before := _width(metadata, network.name)) != network.width:
+            raise ToftrackError(
+                f"{path} holds weights for a width of {before}, and the width to train is"
+                f" {network.width}; give the same"
+            )
+        _fill(network, arrays)
+    return str(metadata["sha256"])
 
 
 def weights_file(path: str | Path | None = None) -> Path:
@@ -79,16 +92,13 @@ def weights_file(path: str | Path | None = None) -> Path:
     return DEFAULT_FILE if path is None else Path(path)
 
 
-@contextmanager
-def other_networks_refused(path: Path) -> Iterator[None]:
+def _other_networks_refused(path: Path) -> AbstractContextManager[None]:
     """Within, what does not fit the networks is a ToftrackError about the file."""
-    try:
-        yield
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError):
-        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
+    kinds = (LookupError, TypeError, ValueError, RuntimeError)
+    return reported_errors(f"{path} holds weights of another network", _AGAIN, *kinds)
 
 
-def network_width(metadata: dict[str, Any], name: str) -> int:
+def _width(metadata: dict[str, Any], name: str) -> int:
     """Of a network; ValueError for one that would take all memory before its weights are seen."""
     width = metadata[f"{name}_width"]
     if type(width) is not int or not 1 <= width <= _WIDEST:
@@ -96,18 +106,14 @@ def network_width(metadata: dict[str, Any], name: str) -> int:
     return width
 
 
-def network_tensors(arrays: dict[str, np.ndarray], name: str) -> dict[str, Tensor]:
-    """One network's arrays as it takes them."""
-    return {
-        key.split(".", 1)[1]: torch.from_numpy(array).float()
-        if array.dtype.kind == "f"
-        else torch.from_numpy(array)
-        for key, array in arrays.items()
-        if key.startswith(name + ".")
-    }
+def _fill(network: PoseNet | Finder, arrays: dict[str, np.ndarray]) -> None:
+    """Give a network its own of the arrays, in its own precision."""
+    start = f"{network.name}."
+    own = [key for key in arrays if key.startswith(start)]
+    network.load_state_dict({key.removeprefix(start): torch.from_numpy(arrays[key]) for key in own})
 
 
-def read_arrays(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def _read_whole(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays and metadata of a file that is whole."""
     arrays, metadata = _read(path)
     if metadata.get("sha256") != checksum(arrays):
@@ -124,19 +130,16 @@ def _read(
     path: Path, names: Collection[str] | None = None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Arrays, or those of some names, and metadata of a file."""
-    try:
+    what = f"{path} is no file of the detector's weights"
+    with reported_errors(what, _AGAIN, OSError, ValueError, KeyError):
+        if not path.exists():
+            raise ToftrackError(f"there are no weights of the detector at {path}; {_AGAIN}")
         if path.stat().st_size > _LARGEST_BYTES:
             raise ToftrackError(f"{path} is too large for weights of the detector; {_AGAIN}")
         arrays = read_archive(path, names)
         metadata = parse_json(str(arrays.pop("metadata")))
         if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
             raise ValueError(f"its metadata do not say {FORMAT}")
-    except FileNotFoundError:
-        raise ToftrackError(f"there are no weights of the detector at {path}; {_AGAIN}") from None
-    except (OSError, ValueError, KeyError) as error:
-        raise ToftrackError(
-            f"{path} is no file of the detector's weights ({error}); {_AGAIN}"
-        ) from None
     if metadata.get("version") != VERSION:
         raise ToftrackError(
             f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"

@@ -1,4 +1,4 @@
-"""What a training goes on from: its own state, written meanwhile, or the weights of another.
+"""What an interrupted training goes on from: its own state, written meanwhile.
 
 A checkpoint is a file of `torch.save`, read with `weights_only=True`: tensors and numbers, nothing
 that runs. What is read must be of the same training: the batch, the rate, the width, the seed, the
@@ -16,12 +16,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from toftrack.detector.weights import (
-    network_tensors,
-    network_width,
-    other_networks_refused,
-    read_arrays,
-)
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.safe_files import open_to_read, whole_file
 
@@ -134,21 +128,3 @@ def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
             setattr(progress, name, content[name])
         recent = content["recent"]
         progress.names, progress.recent = list(recent), torch.tensor(list(recent.values()))
-
-
-def go_on_from(path: str | Path, name: str, network: nn.Module, width: int) -> str:
-    """Give a new network, "pose" or "finder" of a width, the weights of a file to train on from.
-
-    Returns the checksum of the file's arrays. Raises ToftrackError as load_weights does, and for
-    weights of another width.
-    """
-    path = Path(path)
-    arrays, metadata = read_arrays(path)
-    with other_networks_refused(path):
-        if (before := network_width(metadata, name)) != width:
-            raise ToftrackError(
-                f"{path} holds weights for a width of {before}, and the width to train is {width};"
-                " give the same"
-            )
-        network.load_state_dict(network_tensors(arrays, name))
-    return str(metadata["sha256"])

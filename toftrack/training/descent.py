@@ -29,10 +29,10 @@ from tqdm import tqdm
 
 from toftrack.compute.transfer import on_device
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.detector.weights import checksum
+from toftrack.detector.weights import checksum, go_on_from
 from toftrack.errors import ToftrackError, check_number
 from toftrack.training.batches import Batches, keep_memory, made_batches, makers, makers_watched
-from toftrack.training.checkpoints import Checkpoints, Progress, go_on_from
+from toftrack.training.checkpoints import Checkpoints, Progress
 from toftrack.training.images import Crops, WideImages, crop_images, wide_images
 from toftrack.training.losses import finder_loss, pose_losses
 from toftrack.training.muon import Muon, half_precision
@@ -113,8 +113,7 @@ def train_network(
     task = _task(network, device)
     start = None
     if schedule.start is not None:
-        name = "pose" if kind is PoseNet else "finder"
-        start = go_on_from(schedule.start, name, network, schedule.width)
+        start = go_on_from(schedule.start, network)
     seed = seed + 1 if kind is Finder else seed
     where = (shapes, checkpoints, device)
     course = _descend(network, task, schedule, seed, start, *where)
