@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -94,14 +95,20 @@ class Detection:
         return np.asarray(knuckle - wrist)
 
 
+OF_HYPOTHESES: dict[str, tuple[int, ...]] = {
+    "pivot_m": (3,),
+    "rotvec": (3,),
+    "angles": (21,),
+    "joints_m": (21, 3),
+    "log_size": (),
+    "log_probability": (),
+    "error_m": (),
+}
+"""Fields that have a row for each hypothesis, in the order in which the compiled code writes them,
+and the shapes of their rows."""
+_NONE: dict[str, Any] = {name: torch.zeros(0, *row) for name, row in OF_HYPOTHESES.items()}
 NO_DETECTION = Detection(
-    pivot_m=torch.zeros(0, 3),
-    rotvec=torch.zeros(0, 3),
-    angles=torch.zeros(0, 21),
-    joints_m=torch.zeros(0, 21, 3),
-    log_size=torch.zeros(0),
-    log_probability=torch.zeros(0),
-    error_m=torch.zeros(0),
+    **_NONE,
     keypoints=Keypoints(torch.zeros(21, 3), torch.full((21,), torch.inf)),
     present=0.0,
     right_side=0.5,

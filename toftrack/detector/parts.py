@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, entry_point
+from toftrack.compute.compiling import entry_point
 from toftrack.detector.crops import CROP_M
 from toftrack.detector.network import PARTS, SEGMENTS
 
@@ -45,30 +45,24 @@ class Parts:
 
 @entry_point
 def _classes(depth, pixels, k, crop, found):
-    """See Parts.seen."""
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if pixels[v, u]:
-                z = np.float64(depth[v, u])
-                x, y = (u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z
-                found[v, u] = _class_of(x, y, z, crop)
-
-
-@compiled
-def _class_of(x, y, z, crop):
-    """The class of a point, camera frame; UNKNOWN_PART where the crop ends."""
+    """See Parts.seen; what is already in `found` stays where the crop ends."""
     kind, turn, centre, mirrored = crop
     parts = kind.shape[0]
     distance = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
-    x = -x if mirrored else x
-    across = x * turn[0, 0] + y * turn[1, 0] + z * turn[2, 0]
-    down = x * turn[0, 1] + y * turn[1, 1] + z * turn[2, 1]
-    away = x * turn[0, 2] + y * turn[1, 2] + z * turn[2, 2]
-    scale = distance / CROP_M / max(away, 1e-6)
-    column, row = parts * (across * scale + 0.5), parts * (down * scale + 0.5)
-    if not (0 <= column < parts and 0 <= row < parts and abs(away - distance) < CROP_M / 2):
-        return np.uint8(UNKNOWN_PART)
-    return kind[int(row), int(column)]
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if not pixels[v, u]:
+                continue
+            z = np.float64(depth[v, u])
+            x, y = (u - k[0, 2]) / k[0, 0] * z, (v - k[1, 2]) / k[1, 1] * z
+            x = -x if mirrored else x
+            across = x * turn[0, 0] + y * turn[1, 0] + z * turn[2, 0]
+            down = x * turn[0, 1] + y * turn[1, 1] + z * turn[2, 1]
+            away = x * turn[0, 2] + y * turn[1, 2] + z * turn[2, 2]
+            scale = distance / CROP_M / max(away, 1e-6)
+            column, row = parts * (across * scale + 0.5), parts * (down * scale + 0.5)
+            if 0 <= column < parts and 0 <= row < parts and abs(away - distance) < CROP_M / 2:
+                found[v, u] = kind[int(row), int(column)]
 
 
 ALL_HAND = Parts(

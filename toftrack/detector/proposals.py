@@ -17,8 +17,8 @@ import torch
 
 from toftrack.detector.crops import CROP, CROP_CHANNELS, crop_at, crop_rotation
 from toftrack.detector.decoding_numba import KEPT, decode_at
-from toftrack.detector.detection import Detection, doubted_sigma_m
-from toftrack.detector.network import ANGLES, JOINTS, STRIDE, Found
+from toftrack.detector.detection import OF_HYPOTHESES, Detection, doubted_sigma_m
+from toftrack.detector.network import JOINTS, STRIDE, Found
 from toftrack.detector.parts import Parts, likeliest_parts
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, default_hand_shape
 from toftrack.refinement.gauss_newton import Keypoints
@@ -77,18 +77,6 @@ def _apart(centres_m: np.ndarray, most: int) -> list[int]:
     return kept
 
 
-_OF_HYPOTHESES = {
-    "pivot_m": (KEPT, 3),
-    "rotvec": (KEPT, 3),
-    "angles": (KEPT, ANGLES),
-    "joints_m": (KEPT, JOINTS, 3),
-    "log_size": (KEPT,),
-    "log_probability": (KEPT,),
-    "error_m": (KEPT,),
-}
-"""Fields of a Detection that have a row for each hypothesis, as the compiled code writes them."""
-
-
 class Crop:
     """The crop that the pose network sees at a place, where a hand of one side is looked for.
 
@@ -117,7 +105,7 @@ class Crop:
     def decode(self, outputs: tuple[np.ndarray, ...]) -> Detection:
         """The detection, in the camera frame, that the network's outputs for the crop mean."""
         heads, keypoints, painted = outputs
-        found = {name: np.empty(shape, np.float32) for name, shape in _OF_HYPOTHESES.items()}
+        found = {name: np.empty((KEPT, *row), np.float32) for name, row in OF_HYPOTHESES.items()}
         points, sigma, odds = (np.empty(shape, np.float32) for shape in ((JOINTS, 3), JOINTS, 2))
         written = *found.values(), points, sigma, odds
         decode_at(heads[0], keypoints[0], self.image[0, 0], *self.place, self.hand, written)
