@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -30,7 +31,16 @@ from toftrack.training.descent import Schedule, train_network
 from toftrack.training.shapes import ShapeBank
 
 TINY = Schedule(images=24, batch=8, rate=0.002, width=4)
-train_poses, train_finder = partial(train_network, PoseNet), partial(train_network, Finder)
+
+
+def train_here(kind: type, schedule: Schedule, shapes: int, seed: int, *kept: Checkpoints) -> tuple:
+    """On the CPU; kept: the checkpoints, which else are thrown away."""
+    with tempfile.TemporaryDirectory() as folder:
+        (checkpoints,) = kept or (Checkpoints(Path(folder), 60),)
+        return train_network(kind, schedule, shapes, seed, checkpoints, torch.device("cpu"))
+
+
+train_poses, train_finder = partial(train_here, PoseNet), partial(train_here, Finder)
 
 
 def same(one: torch.nn.Module, two: torch.nn.Module) -> None:

@@ -7,7 +7,6 @@ number of hands and the weights that it began from, by their checksum; it contin
 
 from __future__ import annotations
 
-import pickle
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -22,10 +21,6 @@ from toftrack.files.safe_files import open_to_read, whole_file
 _SUFFIX = ".checkpoint.pt"
 _STATES = ("network", "averaged", "optimiser")
 _NUMBERS = ("images", "step", "seconds", "course")
-_BROKEN = (
-    *(OSError, EOFError, pickle.UnpicklingError, LookupError, AttributeError),
-    *(TypeError, ValueError, RuntimeError),
-)
 _NEWEST = 0.01
 """Weight of a step in the running means."""
 
@@ -89,8 +84,25 @@ class Checkpoints:
                 f"there is no checkpoint of a training in {self.resume}; train without resume"
             )
         path = self.resume / f"{name}{_SUFFIX}"
-        if path.exists():
-            _restore(path, progress, settings)
+        if not path.exists():
+            return
+        what = f"{path} is no checkpoint of a training of the detector"
+        with reported_errors(what, "train without resume", Exception):  # reading may raise any
+            with open_to_read(path) as stream:
+                content = torch.load(stream, map_location="cpu", weights_only=True)
+            before = content["settings"]
+            for key, value in settings.items():
+                if before[key] != value:
+                    raise ToftrackError(
+                        f"{path} is a checkpoint of a training with {key}={before[key]}, but now"
+                        f" {key}={value}; give the same, or train without resume"
+                    )
+            for key in _STATES:
+                getattr(progress, key).load_state_dict(content[key])
+            for key in _NUMBERS:
+                setattr(progress, key, content[key])
+            recent = content["recent"]
+            progress.names, progress.recent = list(recent), torch.tensor(list(recent.values()))
 
     def write(
         self, name: str, progress: Progress, settings: dict[str, Any], now: bool = False
@@ -108,23 +120,3 @@ def save(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
     content |= {"settings": settings, "recent": progress.means()}
     with whole_file(path) as stream:
         torch.save(content, stream)
-
-
-def _restore(path: Path, progress: Progress, settings: dict[str, Any]) -> None:
-    what = f"{path} is no checkpoint of a training of the detector"
-    with reported_errors(what, "train without resume", *_BROKEN):
-        with open_to_read(path) as stream:
-            content = torch.load(stream, map_location="cpu", weights_only=True)
-        before = content["settings"]
-        for name, value in settings.items():
-            if before[name] != value:
-                raise ToftrackError(
-                    f"{path} is a checkpoint of a training with {name}={before[name]}, but now"
-                    f" {name}={value}; give the same, or train without resume"
-                )
-        for name in _STATES:
-            getattr(progress, name).load_state_dict(content[name])
-        for name in _NUMBERS:
-            setattr(progress, name, content[name])
-        recent = content["recent"]
-        progress.names, progress.recent = list(recent), torch.tensor(list(recent.values()))

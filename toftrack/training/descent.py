@@ -41,7 +41,6 @@ _WARM = 300
 """Steps in which the rate rises."""
 _STEADY = 2 / 3
 """Share of the images after which it falls."""
-_CPU = torch.device("cpu")
 _DECAY = 0.02
 """Of the weights, times the learning rate, in each step."""
 _RESTART_SHARE = 0.5
@@ -100,8 +99,8 @@ def train_network(
     schedule: Schedule,
     shapes: int,
     seed: int,
-    checkpoints: Checkpoints | None = None,
-    device: torch.device = _CPU,
+    checkpoints: Checkpoints,
+    device: torch.device,
 ) -> tuple[Network, Course]:
     """Train a network on a device; returns the average of its weights, on the CPU, and the course.
 
@@ -111,9 +110,7 @@ def train_network(
     torch.manual_seed(seed)
     network = kind(schedule.width)
     task = _task(network, device)
-    start = None
-    if schedule.start is not None:
-        start = go_on_from(schedule.start, network)
+    start = None if schedule.start is None else go_on_from(schedule.start, network)
     seed = seed + 1 if kind is Finder else seed
     where = (shapes, checkpoints, device)
     course = _descend(network, task, schedule, seed, start, *where)
@@ -232,7 +229,7 @@ def _descend(
     seed: int,
     start: str | None,
     shapes: int,
-    checkpoints: Checkpoints | None,
+    checkpoints: Checkpoints,
     device: torch.device,
 ) -> Course:
     """Train a network until the rate has fallen to nothing; it is left with the average of its
@@ -247,19 +244,17 @@ def _descend(
     progress = Progress(network, averaged, optimiser, schedule.images)
     settings: dict[str, Any] = {"batch": schedule.batch, "rate": schedule.rate}
     settings |= {"width": schedule.width, "shapes": shapes, "seed": seed, "start": start}
-    if checkpoints is not None:
-        checkpoints.restore(task.name, progress, settings)
-        _check_length(task.name, progress, schedule)
+    checkpoints.restore(task.name, progress, settings)
+    _check_length(task.name, progress, schedule)
     course = progress.course
     before, began = progress.seconds, time.perf_counter()
     images = steps * schedule.batch
     done = progress.step * schedule.batch
     bar = tqdm(total=images, initial=done, unit=" images", desc=task.name, file=sys.stderr)
-    numbers = range(progress.step, steps)
     batches = Batches(task.make, schedule.batch, shapes, seed)
     step = _Step(task, progress, device)
     with bar, makers_watched():
-        for batch in made_batches(batches, numbers, makers(device)):
+        for batch in made_batches(batches, range(progress.step, steps), makers(device)):
             number = progress.step
             share = 1 - min(0.998, (number + 1) / (number + 10))
             progress.add(step(batch, schedule.rate_at(number), share))
@@ -271,10 +266,8 @@ def _descend(
                 bar.set_postfix({k: f"{v:.3g}" for k, v in recent.items()}, refresh=False)
                 seen = {"images": (number + 1) * schedule.batch}
                 course.append(seen | {"seconds": round(progress.seconds, 1)} | recent)
-            if checkpoints is not None:
-                checkpoints.write(task.name, progress, settings)
-    if checkpoints is not None:
-        checkpoints.write(task.name, progress, settings, now=True)
+            checkpoints.write(task.name, progress, settings)
+    checkpoints.write(task.name, progress, settings, now=True)
     network.load_state_dict(averaged.state_dict())
     return course
 
