@@ -22,7 +22,7 @@ from toftrack.training.dice import Dice
 from toftrack.training.hands import FOREARM, THING
 from toftrack.training.scenes import Scenes
 from toftrack.training.skin_numba import draw_skin
-from toftrack.training.things_numba import TILE, draw_part
+from toftrack.training.things_numba import TILE, draw_part, seen_between
 
 (
     NOISE, FLYING, BIAS, HOLES, STEP, SHADOW, RANGE, PATCHES, BLUR, DARK, SMOOTH, COARSE, HOLLOW,
@@ -145,15 +145,9 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
     yz = axes[1, 0] * axes[2, 0] + axes[1, 1] * axes[2, 1] + axes[1, 2] * axes[2, 2]
     if cz - math.sqrt(zz) < 0.05:
         return
-    w = 1 / (cz * cz - zz)
     f, px, py = lens[0], lens[1], lens[2]
-    x0, y0 = (cx * cz - xz) * w, (cy * cz - yz) * w
-    hx = math.sqrt(max(x0 * x0 - (cx * cx - xx) * w, 0.0))
-    hy = math.sqrt(max(y0 * y0 - (cy * cy - yy) * w, 0.0))
-    left = max(0, math.ceil((x0 - hx) * f + px))
-    right = min(int(lens[3]) - 1, math.floor((x0 + hx) * f + px))
-    top = max(0, math.ceil((y0 - hy) * f + py))
-    bottom = min(int(lens[4]) - 1, math.floor((y0 + hy) * f + py))
+    left, right = seen_between(cx, cz, xx, xz, zz, f, px, int(lens[3]))
+    top, bottom = seen_between(cy, cz, yy, yz, zz, f, py, int(lens[4]))
     p0 = whiten[0, 0] * cx + whiten[0, 1] * cy + whiten[0, 2] * cz
     p1 = whiten[1, 0] * cx + whiten[1, 1] * cy + whiten[1, 2] * cz
     p2 = whiten[2, 0] * cx + whiten[2, 1] * cy + whiten[2, 2] * cz

@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from toftrack.compute.compiling import compiled
-from toftrack.training.things_numba import CORNER, MIDDLE, TILE, ball_box
+from toftrack.training.things_numba import CORNER, MIDDLE, TILE, seen_between
 
 _STEPS = 12
 _NEAR_M = np.float32(0.001)
@@ -90,8 +90,8 @@ def draw_skin(skin, lens, depth, labels, work):
         balls[i, 0], balls[i, 1], balls[i, 2], balls[i, 3] = x, y, z, r
         if z - r < 0.05:
             continue
-        left, right = ball_box(x, z, r, f, lens[1], width)
-        top, bottom = ball_box(y, z, r, f, lens[2], height)
+        left, right = seen_between(x, z, r * r, np.float32(0), r * r, f, lens[1], width)
+        top, bottom = seen_between(y, z, r * r, np.float32(0), r * r, f, lens[2], height)
         for row in range(top // TILE, bottom // TILE + 1):
             for column in range(left // TILE, right // TILE + 1):
                 tile = row * columns + column

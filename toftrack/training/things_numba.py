@@ -22,15 +22,18 @@ _STEPS, _BUNDLE_STEPS = 48, 16
 TILE = 4
 MIDDLE, CORNER = np.float32(1.5), np.float32(2.13)
 """Of a tile, pixels: its side, middle, and how far a corner is from that."""
-_NEAR_M = np.float32(0.0004)
+_NEAR_M, _NONE = np.float32(0.0004), np.float32(0)
 
 
 @compiled
-def ball_box(x, z, r, f, middle, size):
-    """First and last pixel, along one axis, of a ball in front of the camera."""
-    w = 1 / (z * z - r * r)
-    at = x * z * w
-    half = math.sqrt(max(at * at - (x * x - r * r) * w, 0.0))
+def seen_between(x, z, xx, xz, zz, f, middle, size):
+    """First and last pixel, along one axis, of an ellipsoid in front of the camera.
+
+    x, z: its middle.  xx, xz, zz: of A A', where the columns of A are its half-axes.
+    """
+    w = 1 / (z * z - zz)
+    at = (x * z - xz) * w
+    half = math.sqrt(max(at * at - (x * x - xx) * w, 0.0))
     first = max(0, math.ceil((at - half) * f + middle))
     return first, min(size - 1, math.floor((at + half) * f + middle))
 
@@ -84,8 +87,9 @@ def draw_part(part, label, lens, depth, labels):
     if z0 - r < 0.05:
         return
     f = lens[0]
-    left, right = ball_box(x0, z0, r, f, lens[1], int(lens[3]))
-    top, bottom = ball_box(y0, z0, r, f, lens[2], int(lens[4]))
+    square = r * r
+    left, right = seen_between(x0, z0, square, _NONE, square, f, lens[1], int(lens[3]))
+    top, bottom = seen_between(y0, z0, square, _NONE, square, f, lens[2], int(lens[4]))
     apart = CORNER / f
     for v0 in range(top, bottom + 1, TILE):
         for u0 in range(left, right + 1, TILE):
