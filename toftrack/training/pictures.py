@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
@@ -90,22 +91,35 @@ def take_pictures(
     size: H, W of the arrays; each picture fills its own width and height of them.
     """
     n = len(sensors)
-    depth = np.zeros((n, *size), np.float32)
+    clean, depth = np.zeros((2, n, *size), np.float32)
     labels = np.full((n, *size), -1, np.int8)
     seeds = torch.randint(1, 2**31 - 1, (n,), generator=dice.generator)
     which = torch.where(scenes.skinned, -1, scenes.labels)
     axes = scenes.axes_m
     ellipsoids = (_plain(scenes.centres_m), _plain(axes), _plain(torch.linalg.inv(axes)))
-    lenses = torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1)
-    _take(
+    lenses = _plain(torch.stack((lens.f_px, lens.cx, lens.cy, lens.width, lens.height), 1))
+    terms = _plain(sensors)
+    _draw_scenes(
         (*ellipsoids, _integers(which)),
         (_plain(scenes.skins), _integers(scenes.skin_labels), _plain(scenes.skin_widths_m)),
         (_plain(scenes.planes), _plain(scenes.parts)),
-        (_plain(lenses), _plain(sensors), seeds.numpy().astype(np.uint32)),
-        depth,
+        lenses,
+        clean,
         labels,
     )
+    for row, seed in enumerate(seeds.tolist()):
+        opened = _opened(clean[row], lenses[row]) if terms[row, HOLLOW] > 0 else clean[row]
+        state = np.array([seed], np.uint32)
+        _sense(terms[row], lenses[row], state, clean[row], opened, depth[row], labels[row])
     return depth, labels
+
+
+def _opened(depth: np.ndarray, lens: np.ndarray) -> np.ndarray:
+    """The opening of a picture's depths, behind which its hollows lie."""
+    seen = depth[: int(lens[4]), : int(lens[3])]
+    reach = int(np.float32(0.5) * _HOLLOW_M * lens[0] / (seen.min() + _HOLLOW_DEPTH_M))
+    about = np.ones((2 * reach + 1, 2 * reach + 1), np.uint8)
+    return cv2.morphologyEx(seen, cv2.MORPH_OPEN, about)
 
 
 def _plain(tensor: Tensor) -> np.ndarray:
@@ -172,12 +186,12 @@ def _draw(centre, axes, whiten, label, lens, depth, labels):
 
 
 @compiled
-def _smooth(reach, width, height, depth, scratch, total, count):
-    """Each reading becomes the mean of those about it that lie on the same surface.
-
-    scratch: (H, W), total and count: (W,), to work in. It goes along rows, so that the arithmetic
-    is vectorised.
+def _smooth(reach, width, height, depth):
+    """Each reading becomes the mean of those about it that lie on the same surface. It goes along
+    rows, so that the arithmetic is vectorised.
     """
+    scratch = np.empty(depth.shape, np.float32)
+    total, count = np.empty(width, np.float32), np.empty(width, np.float32)
     for v in range(height):
         for u in range(width):
             scratch[v, u] = depth[v, u]
@@ -197,49 +211,16 @@ def _smooth(reach, width, height, depth, scratch, total, count):
                 depth[v, u] = total[u] / count[u]
 
 
-@compiled
-def _deepen(part, lens, depth, around, scratch):
-    """Hollows of `depth` become deeper by a part of their depth.
-
-    around, scratch: (H, W) to work in. A hollow lies behind the opening of the depths: the farthest
-    of the nearest ones about each pixel.
-    """
+@shared_entry_point
+def _sense(sensor, lens, state, clean, opened, depth, labels):
+    """What a sensor makes of a picture: `depth`, from `clean`, whose hollows become deeper."""
     width, height = int(lens[3]), int(lens[4])
-    nearest = np.float32(8.0)
-    for v in range(height):
-        for u in range(width):
-            nearest = min(nearest, depth[v, u])
-    reach = int(np.float32(0.5) * _HOLLOW_M * lens[0] / (nearest + _HOLLOW_DEPTH_M))
-    for v in range(height):
-        for u in range(width):
-            around[v, u] = depth[v, u]
-    for sign in (np.float32(1.0), np.float32(-1.0)):
+    if sensor[HOLLOW] > 0:
         for v in range(height):
             for u in range(width):
-                scratch[v, u] = around[v, u]
-            for shift in range(-reach, reach + 1):
-                for u in range(max(-shift, 0), width - max(shift, 0)):
-                    other = around[v, u + shift]
-                    closer = sign * other < sign * scratch[v, u]
-                    scratch[v, u] = other if closer else scratch[v, u]
-        for v in range(height):
-            for u in range(width):
-                around[v, u] = scratch[v, u]
-            for v2 in range(max(v - reach, 0), min(v + reach, height - 1) + 1):
-                for u in range(width):
-                    closer = sign * scratch[v2, u] < sign * around[v, u]
-                    around[v, u] = scratch[v2, u] if closer else around[v, u]
-    for v in range(height):
-        for u in range(width):
-            hollow = depth[v, u] - around[v, u]
-            if hollow < _HOLLOW_DEPTH_M:
-                depth[v, u] += part * hollow
-
-
-@compiled
-def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
-    """What a sensor makes of a picture: `depth` in place, from `clean`; rows: (2, W) to work in."""
-    width, height = int(lens[3]), int(lens[4])
+                hollow = clean[v, u] - opened[v, u]
+                if hollow < _HOLLOW_DEPTH_M:
+                    clean[v, u] += sensor[HOLLOW] * hollow
     blur, flying = sensor[BLUR] > 0, sensor[FLYING]
     shadow = int(sensor[SHADOW])
     for v in range(height):
@@ -267,7 +248,7 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
                 z = math.floor(z / step + 0.5) * step
             depth[v, u] = max(z, 0.0)
     if sensor[SMOOTH] > 0:
-        _smooth(int(sensor[SMOOTH]), width, height, depth, scratch, rows[0], rows[1])
+        _smooth(int(sensor[SMOOTH]), width, height, depth)
     if sensor[COARSE] > 0:
         for v in range(height):
             for u in range(width):
@@ -290,11 +271,10 @@ def _sense(sensor, lens, state, depth, labels, clean, scratch, rows):
 
 
 @shared_entry_point
-def _take(ellipsoids, skins, others, cameras, depth, labels):
-    """All pictures of a batch, see take_pictures."""
+def _draw_scenes(ellipsoids, skins, others, lenses, depth, labels):
+    """Exact depths of all pictures of a batch, see take_pictures."""
     (centres, axes, whiten, which), (primitives, whose, widths) = ellipsoids, skins
-    (planes, parts), (lenses, sensors, seeds) = others, cameras
-    state = np.zeros(1, np.uint32)
+    planes, parts = others
     tiles = (depth.shape[1] // TILE + 1) * (depth.shape[2] // TILE + 1)
     count = primitives.shape[2]
     balls, lists = np.empty((count, 4), np.float32), np.empty((tiles, count), np.int64)
@@ -303,12 +283,8 @@ def _take(ellipsoids, skins, others, cameras, depth, labels):
     six = np.empty((6, TILE * TILE), np.float32)
     rays = six[0], six[1], six[2], six[3], six[4], six[5]
     work = balls, lists, counts, on, near, rays
-    clean, scratch = np.zeros(depth.shape[1:], np.float32), np.empty(depth.shape[1:], np.float32)
-    around = np.empty(depth.shape[1:], np.float32)
-    rows = np.empty((2, depth.shape[2]), np.float32)
     for n in range(len(depth)):
         lens = lenses[n]
-        state[0] = seeds[n]
         width, height = int(lens[3]), int(lens[4])
         for v in range(height):
             y = (np.float32(v) - lens[2]) / lens[0]
@@ -320,20 +296,18 @@ def _take(ellipsoids, skins, others, cameras, depth, labels):
                     z = planes[n, p, 3] / across
                     if 0.1 < z < nearest:
                         nearest = z
-                clean[v, u] = nearest
+                depth[n, v, u] = nearest
                 labels[n, v, u] = 0
         for e in range(centres.shape[1]):
             if which[n, e] >= 0:
-                _draw(centres[n, e], axes[n, e], whiten[n, e], which[n, e], lens, clean, labels[n])
+                one = centres[n, e], axes[n, e], whiten[n, e], which[n, e]
+                _draw(*one, lens, depth[n], labels[n])
         for q in range(parts.shape[1]):
             if parts[n, q, 0] >= 0:
-                draw_part(parts[n, q], THING, lens, clean, labels[n])
+                draw_part(parts[n, q], THING, lens, depth[n], labels[n])
         for s in range(primitives.shape[1]):
             skin = primitives[n, s], whose[n, s], widths[n, s, 0], widths[n, s, 1]
-            draw_skin(skin, lens, clean, labels[n], work)
-        if sensors[n, HOLLOW] > 0:
-            _deepen(sensors[n, HOLLOW], lens, clean, around, scratch)
-        _sense(sensors[n], lens, state, depth[n], labels[n], clean, scratch, rows)
+            draw_skin(skin, lens, depth[n], labels[n], work)
 
 
 _PER_PART = CROP // PARTS
