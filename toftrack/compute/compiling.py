@@ -95,9 +95,8 @@ entry_point = Kernel
 wait for longer than they run; long ones, and those that threads share, are shared_entry_point."""
 
 
-def shared_entry_point(function: Callable) -> Kernel:
-    """An entry point that lets go of the interpreter's lock meanwhile."""
-    return Kernel(function, nogil=True)
+shared_entry_point = functools.partial(Kernel, nogil=True)
+"""Decorator of entry points that let go of the interpreter's lock meanwhile."""
 
 
 @contextlib.contextmanager

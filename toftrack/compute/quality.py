@@ -94,7 +94,9 @@ class Pace:
         frames = self.frames + 1
         easy = self.easy + 1 if mean < _EASY * self.budget_s else 0
         if mean > _USED * self.budget_s and frames >= _FEWEST:
-            return self._less(mean)
+            level = min(self.level + (2 if mean > _FAR * self.budget_s else 1), len(LEVELS) - 1)
+            patience = min(2 * self.patience, _MOST_PATIENT) if self.trying else self.patience
+            return Pace(self.budget_s, level, patience=patience)
         if easy > self.patience and self.level > 0:
             return Pace(self.budget_s, self.level - 1, patience=self.patience, trying=True)
         proved = frames > 2 * self.patience
@@ -106,12 +108,6 @@ class Pace:
             patience=_PATIENCE if proved else self.patience,
             trying=self.trying and not proved,
         )
-
-    def _less(self, mean_s: float) -> Pace:
-        assert self.budget_s is not None
-        steps = 2 if mean_s > _FAR * self.budget_s else 1
-        patience = min(2 * self.patience, _MOST_PATIENT) if self.trying else self.patience
-        return Pace(self.budget_s, min(self.level + steps, len(LEVELS) - 1), patience=patience)
 
 
 def pace_within(budget_ms: float | None) -> Pace:

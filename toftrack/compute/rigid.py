@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ BOUNDS = ("truncate", "reflect")
 LEAST_WIDTH = 1e-30
 """What a box is taken to be wide at least where coordinates are folded back into it."""
 Redraw = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, str], Tensor]
-"""See `redraw_with`, without the motion."""
+"""See `redraw`, without the motion."""
 
 
 class Motions(NamedTuple):
@@ -136,27 +137,24 @@ def bound(latent: Tensor, lower: Tensor, upper: Tensor, mode: str) -> Tensor:
     return lower + torch.minimum(folded, there_and_back - folded)
 
 
-def redraw_with(compose: Callable[[Tensor, Tensor], Tensor]) -> Redraw:
-    """Draws that move particles by a motion (paper, section 2.3)."""
+def redraw(
+    compose: Callable[[Tensor, Tensor], Tensor],
+    particles: Tensor,
+    weights: Tensor,
+    positions: Tensor,
+    tangents: Tensor,
+    lower: Tensor,
+    upper: Tensor,
+    mode: str,
+) -> Tensor:
+    """(M, 6 + d) particles of weights (M,) at positions (n,), moved (paper, section 2.3) by a
+    motion, see Motions: (n, 6 + d).
 
-    def redraw(
-        particles: Tensor,
-        weights: Tensor,
-        positions: Tensor,
-        tangents: Tensor,
-        lower: Tensor,
-        upper: Tensor,
-        mode: str,
-    ) -> Tensor:
-        """(M, 6 + d) particles of weights (M,) at positions (n,), moved: (n, 6 + d).
-
-        positions, lower, upper, mode: see pick and bound.  tangents: (n, 6 + d) of the moves.
-        """
-        moved = compose(particles[pick(weights, positions)], tangents)
-        moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
-        return moved
-
-    return redraw
+    positions, lower, upper, mode: see pick and bound.  tangents: (n, 6 + d) of the moves.
+    """
+    moved = compose(particles[pick(weights, positions)], tangents)
+    moved[:, 6:] = bound(moved[:, 6:], lower, upper, mode)
+    return moved
 
 
-MOTIONS = Motions(compose, difference, redraw_with(compose), mean)
+MOTIONS = Motions(compose, difference, partial(redraw, compose), mean)

@@ -5,13 +5,15 @@ The same formulas as in rigid_numba.py, in float32, a lane to a particle.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
 
 from toftrack.compute import rigid
-from toftrack.compute.rigid import PIVOT_M, Motions, redraw_with
+from toftrack.compute.rigid import PIVOT_M, Motions
 
 _BLOCK = 64
 
@@ -160,5 +162,5 @@ def difference(particles: Tensor, reference: Tensor) -> Tensor:
     return out
 
 
-MOTIONS = Motions(compose, difference, redraw_with(compose), rigid.mean)
+MOTIONS = Motions(compose, difference, partial(rigid.redraw, compose), rigid.mean)
 """Of particles on a CUDA device."""

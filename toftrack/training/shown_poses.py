@@ -64,31 +64,27 @@ _BENT_DEG = 70.0
 
 
 class Shown(NamedTuple):
-    """What people show. thumbs: any of these.  fingers: states, index finger first."""
+    """What people show. thumbs: any of these.  fingers: four states, index finger first."""
 
     name: str
     thumbs: tuple[str, ...]
-    fingers: tuple[str, str, str, str]
+    fingers: tuple[str, ...]
     spread: int
     weight: float
-
-
-def _four(state: str) -> tuple[str, str, str, str]:
-    return (state, state, state, state)
 
 
 _UP = ("out", "up")
 _CLOSED = ("across", "tucked", "hooked", "folded")
 SHOWN = (
-    Shown("palm", ("out", "up", "beside"), _four("straight"), _APART, 6),
-    Shown("stretched palm", _UP, _four("back"), _APART, 5),
-    Shown("flat", ("beside", "beside", "beside", "out"), _four("straight"), _TOGETHER, 11),
-    Shown("flat, thumb away", ("up", "out"), _four("straight"), _TOGETHER, 4),
-    Shown("fist", ("across", "across", "beside", "hooked"), _four("tight"), _TOGETHER, 18),
-    Shown("fist about the thumb", ("tucked", "folded"), _four("over"), _TOGETHER, 2),
-    Shown("loose fist", _CLOSED, _four("loose"), _ANY, 3),
-    Shown("thumb up", ("up", "out", "up"), _four("tight"), _TOGETHER, 15),
-    Shown("thumb up, loose", ("up", "out"), _four("loose"), _ANY, 2),
+    Shown("palm", ("out", "up", "beside"), 4 * ("straight",), _APART, 6),
+    Shown("stretched palm", _UP, 4 * ("back",), _APART, 5),
+    Shown("flat", ("beside", "beside", "beside", "out"), 4 * ("straight",), _TOGETHER, 11),
+    Shown("flat, thumb away", ("up", "out"), 4 * ("straight",), _TOGETHER, 4),
+    Shown("fist", ("across", "across", "beside", "hooked"), 4 * ("tight",), _TOGETHER, 18),
+    Shown("fist about the thumb", ("tucked", "folded"), 4 * ("over",), _TOGETHER, 2),
+    Shown("loose fist", _CLOSED, 4 * ("loose",), _ANY, 3),
+    Shown("thumb up", ("up", "out", "up"), 4 * ("tight",), _TOGETHER, 15),
+    Shown("thumb up, loose", ("up", "out"), 4 * ("loose",), _ANY, 2),
     Shown("point", _CLOSED, ("straight", "tight", "tight", "tight"), _ANY, 7),
     Shown("point, loose", _CLOSED, ("straight", "loose", "loose", "loose"), _ANY, 3),
     Shown("point with thumb", _UP, ("straight", "tight", "tight", "tight"), _ANY, 7),
@@ -99,23 +95,23 @@ SHOWN = (
     Shown("two together", _CLOSED, ("straight", "straight", "tight", "tight"), _TOGETHER, 3),
     Shown("crossed fingers", _CLOSED, ("straight", "half", "tight", "tight"), _CROSSED, 1),
     Shown("three", _CLOSED, ("straight", "straight", "straight", "tight"), _ANY, 5),
-    Shown("four", ("tucked", "folded", "across"), _four("straight"), _ANY, 5),
-    Shown("flat, thumb folded", ("folded", "across", "tucked"), _four("straight"), _TOGETHER, 3),
+    Shown("four", ("tucked", "folded", "across"), 4 * ("straight",), _ANY, 5),
+    Shown("flat, thumb folded", ("folded", "across", "tucked"), 4 * ("straight",), _TOGETHER, 3),
     Shown("index and little", _CLOSED, ("straight", "tight", "tight", "straight"), _ANY, 4),
     Shown("thumb, index and little", _UP, ("straight", "tight", "tight", "straight"), _ANY, 3),
     Shown("little", _CLOSED, ("tight", "tight", "tight", "straight"), _ANY, 6),
     Shown("thumb and little", _UP, ("tight", "tight", "tight", "straight"), _ANY, 3),
     Shown("middle", _CLOSED, ("tight", "straight", "tight", "tight"), _ANY, 1),
-    Shown("bent knuckles", ("beside", "opposed", "out"), _four("bent"), _ANY, 6),
-    Shown("flat beak", ("opposed", "across"), _four("bent"), _TOGETHER, 2),
-    Shown("hook", ("out", "beside", "up", "across"), _four("hooked"), _ANY, 6),
-    Shown("claw", ("out", "up", "opposed"), _four("claw"), _APART, 4),
-    Shown("curved", ("opposed", "out"), _four("curved"), _TOGETHER, 3),
-    Shown("all tips together", ("opposed", "across"), _four("round"), _TOGETHER, 2),
+    Shown("bent knuckles", ("beside", "opposed", "out"), 4 * ("bent",), _ANY, 6),
+    Shown("flat beak", ("opposed", "across"), 4 * ("bent",), _TOGETHER, 2),
+    Shown("hook", ("out", "beside", "up", "across"), 4 * ("hooked",), _ANY, 6),
+    Shown("claw", ("out", "up", "opposed"), 4 * ("claw",), _APART, 4),
+    Shown("curved", ("opposed", "out"), 4 * ("curved",), _TOGETHER, 3),
+    Shown("all tips together", ("opposed", "across"), 4 * ("round",), _TOGETHER, 2),
     Shown(
         "one up, the others round", ("opposed",), ("straight", "round", "round", "round"), _ANY, 2
     ),
-    Shown("relaxed", ("out", "opposed", "beside"), _four("half"), _ANY, 6),
+    Shown("relaxed", ("out", "opposed", "beside"), 4 * ("half",), _ANY, 6),
 )
 _FLAT_KNUCKLES = 0.4
 """How many of those who close fingers hardly bend their knuckles: tight ones are folded."""
