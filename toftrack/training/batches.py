@@ -17,11 +17,9 @@ from multiprocessing import resource_tracker
 from typing import Any
 
 import torch
-from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from toftrack.compute.threads import threads
-from toftrack.detector.crops import CROP
 from toftrack.errors import ToftrackError
 from toftrack.training.shapes import ShapeBank, shape_bank
 
@@ -54,8 +52,8 @@ def makers(device: torch.device) -> int:
 
 @dataclass(frozen=True)
 class Batches(Dataset[Any]):
-    """Batches by their numbers, NamedTuples of arrays, images in half precision, which is more than
-    a sensor's. make: what makes a NamedTuple of tensors of (batch, bank, generator).
+    """Batches by their numbers, NamedTuples of arrays, `image` in half precision, which is more
+    than a sensor's. make: what makes a NamedTuple of tensors of (batch, bank, generator).
 
     Arrays travel by themselves: torch would share its tensors' memory through a helper that a busy
     machine may starve.
@@ -70,7 +68,8 @@ class Batches(Dataset[Any]):
         bank, first = _bank(self.shapes, self.seed)
         generator = torch.Generator().manual_seed((first + number) % 2**32)
         made = self.make(self.batch, bank, generator)
-        return type(made)(*((one.half() if _is_image(one) else one).numpy() for one in made))
+        made = made._replace(image=made.image.half())
+        return type(made)(*(one.numpy() for one in made))
 
 
 @functools.cache
@@ -78,10 +77,6 @@ def _bank(shapes: int, seed: int) -> tuple[ShapeBank, int]:
     """The hands of a training, and what its batches' seeds begin from."""
     generator = torch.Generator().manual_seed(seed)
     return shape_bank(shapes, generator), int(torch.randint(2**31, (1,), generator=generator))
-
-
-def _is_image(one: Tensor) -> bool:
-    return one.ndim == 4 and one.shape[-1] >= CROP
 
 
 def made_batches(batches: Batches, numbers: range, makers: int) -> Iterator[Any]:
