@@ -76,11 +76,6 @@ class Pace:
     trying: bool = False
 
     @property
-    def quality(self) -> Quality:
-        """For the next frame."""
-        return LEVELS[self.level]
-
-    @property
     def reduced(self) -> bool:
         """Whether something is left out of the next frame."""
         return self.level >= REDUCED
@@ -140,7 +135,7 @@ class Timekeeper:
             self.pace = self.pace.after(self._took_s)
         self._began_s = self._clock() if began_s is None else began_s
         self.reduced += self.pace.reduced
-        return self.pace.quality
+        return LEVELS[self.pace.level]
 
     def took_s(self) -> float:
         """Seconds since the frame began. It took as long as was said last before the next one."""

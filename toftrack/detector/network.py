@@ -81,6 +81,11 @@ class Proposed(NamedTuple):
     parts: Tensor
 
 
+def _layer(inputs: int, outputs: int, size: int, stride: int) -> tuple[nn.Module, ...]:
+    convolution = nn.Conv2d(inputs, outputs, size, stride, size // 2, bias=False)
+    return convolution, nn.BatchNorm2d(outputs), nn.ReLU()
+
+
 class Residual(nn.Module):
     """Two 3 x 3 convolutions beside a shortcut."""
 
@@ -114,9 +119,7 @@ class PoseNet(nn.Module):
         super().__init__()
         self.width = width
         w1, w2, w3, w4 = width, 2 * width, 4 * width, 6 * width
-        self.stem = nn.Sequential(
-            nn.Conv2d(CROP_CHANNELS, w1, 5, 2, 2, bias=False), nn.BatchNorm2d(w1), nn.ReLU()
-        )
+        self.stem = nn.Sequential(*_layer(CROP_CHANNELS, w1, 5, 2))
         self.fine = Residual(w1, w2, 2)  # 16 x 16
         self.middle = nn.Sequential(Residual(w2, w3, 2), Residual(w3, w3))  # 8 x 8
         self.coarse = Residual(w3, w4, 2)  # 4 x 4
@@ -129,11 +132,7 @@ class PoseNet(nn.Module):
         self.context = nn.Linear(384, 2 * width)
         self.lateral_16 = nn.Conv2d(w2, 2 * width, 1)
         self.lateral_8 = nn.Conv2d(w3, 2 * width, 1)
-        self.smooth = nn.Sequential(
-            nn.Conv2d(2 * width, 2 * width, 3, 1, 1, bias=False),
-            nn.BatchNorm2d(2 * width),
-            nn.ReLU(),
-        )
+        self.smooth = nn.Sequential(*_layer(2 * width, 2 * width, 3, 1))
         self.keypoints = nn.Conv2d(2 * width, 5 * JOINTS, 1)
         self.painted = nn.Conv2d(2 * width, 4 * SEGMENTS, 1)
         steps = (torch.arange(CELLS) + 0.5) / CELLS - 0.5
@@ -237,15 +236,7 @@ class Finder(nn.Module):
         super().__init__()
         self.width = width
         w1, w2 = width, 2 * width
-        self.fine = nn.Sequential(
-            nn.Conv2d(2, 16, 5, 2, 2, bias=False),
-            nn.BatchNorm2d(16),
-            nn.ReLU(),
-            nn.Conv2d(16, w1, 3, 2, 1, bias=False),
-            nn.BatchNorm2d(w1),
-            nn.ReLU(),
-            Residual(w1, w1),
-        )
+        self.fine = nn.Sequential(*_layer(2, 16, 5, 2), *_layer(16, w1, 3, 2), Residual(w1, w1))
         self.middle = nn.Sequential(Residual(w1, w2, 2), Residual(w2, w2))
         self.coarse = nn.Sequential(
             Residual(w2, w2, 2), Residual(w2, w2), Residual(w2, w2, dilation=2)

@@ -6,6 +6,7 @@ import hashlib
 import json
 from collections.abc import Collection
 from contextlib import AbstractContextManager
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from toftrack.detector.network import Finder, PoseNet, Residual
+from toftrack.detector.network import Finder, PoseNet
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
@@ -158,22 +159,13 @@ def checksum(arrays: dict[str, np.ndarray]) -> str:
 
 
 def make_ready(network: nn.Module) -> None:
-    """Make a network fit for use: no gradients, normalisation folded into the convolutions."""
+    """Make a network fit for use: no gradients, each normalisation folded into the convolution
+    before it.
+    """
     network.eval().requires_grad_(False)
-    for module in network.modules():
-        if isinstance(module, Residual):
-            for convolution, norm in (("first", "norm_1"), ("second", "norm_2")):
-                _fold(module, convolution, norm)
-        elif isinstance(module, nn.Sequential):
-            for number in range(len(module) - 1):
-                if isinstance(module[number + 1], nn.BatchNorm2d):
-                    _fold(module, str(number), str(number + 1))
+    for module in list(network.modules()):
+        for (name, part), (norm, after) in pairwise(list(module.named_children())):
+            if isinstance(part, nn.Conv2d) and isinstance(after, nn.BatchNorm2d):
+                setattr(module, name, fuse_conv_bn_eval(part, after))
+                setattr(module, norm, nn.Identity())
     network.to(memory_format=torch.channels_last)
-
-
-def _fold(module: nn.Module, convolution: str, norm: str) -> None:
-    """Fold one of a module's normalisations into the convolution before it."""
-    before, after = module.get_submodule(convolution), module.get_submodule(norm)
-    assert isinstance(before, nn.Conv2d) and isinstance(after, nn.BatchNorm2d)
-    setattr(module, convolution, fuse_conv_bn_eval(before, after))
-    setattr(module, norm, nn.Identity())
