@@ -15,8 +15,6 @@ from toftrack.compute.compiling import compiled, shared_entry_point
 from toftrack.compute.rigid_numba import mix_columns
 from toftrack.training.things_numba import part_distance
 
-CLOSE, YIELD = range(2)
-"""What a finger does: it closes on the thing, or gives way where it is in it."""
 _STEP, _BACK = math.radians(6.0), math.radians(9.0)
 _HALVINGS = 4
 _LEAST, _STRAIGHT, _WIDEST = math.radians(-20.0), math.radians(-10.0), math.radians(40.0)
@@ -215,13 +213,14 @@ def _yield(finger, angles, hand):
 
 
 @shared_entry_point
-def grasp(angles, thumbs, opposed, most, tasks, in_palm, flesh, bones, parts, said):
+def grasp(angles, thumbs, opposed, most, closing, in_palm, flesh, bones, parts, said):
     """N hands on N things.
 
     angles: (N, 21), bent in place.  thumbs: (N, K, 5) where the thumbs of power grasps begin, tried
     one after another.  opposed: (N,) whether the thumb is taken that is the most opposed, not the
     first one whose pad touches the thing.  most: (N, 21) beyond which nothing bends.
-    tasks: (N, 5) CLOSE or YIELD.  in_palm: (N,) the thing is to touch the palm; its parts
+    closing: (N,) whether middle, ring and little finger close on the thing, too; else they only
+    give way where they are in it.  in_palm: (N,) the thing is to touch the palm; its parts
     (N, Q, PART) are moved.  flesh: (N,) how thick the palm is before its bones.
     bones: frames (N, 5, 3, 3), places (N, 5, 3) and lengths (N, 5, 3) of HandShape; radii of
     capsules, and how far palmward they lie (N, 5, 3).
@@ -237,7 +236,7 @@ def grasp(angles, thumbs, opposed, most, tasks, in_palm, flesh, bones, parts, sa
             _place_in_palm(parts[n], base[n], flesh[n])
         for finger in (1, 2, 3, 4):
             _yield(finger, angles[n], hand)
-            if tasks[n, finger] == CLOSE:
+            if finger == 1 or closing[n]:
                 _close(finger, most[n], angles[n], hand)
         # The thumb last: the fingers hold the thing already.
         if in_palm[n]:
@@ -258,8 +257,7 @@ def grasp(angles, thumbs, opposed, most, tasks, in_palm, flesh, bones, parts, sa
             angles[n, :5] = thumb
         else:
             _yield(0, angles[n], hand)
-            if tasks[n, 0] == CLOSE:
-                _close(0, most[n], angles[n], hand)
+            _close(0, most[n], angles[n], hand)
         touching, deepest = 0, 0.0
         for finger in range(5):
             gap = _gap(finger, 0, angles[n], hand)

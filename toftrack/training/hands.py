@@ -21,7 +21,7 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.hand.surface import HandSurface
 from toftrack.pose_space.base import clamp_to_joint_limits
 from toftrack.training.dice import Dice
-from toftrack.training.grasps_numba import CLOSE, YIELD, grasp
+from toftrack.training.grasps_numba import grasp
 from toftrack.training.held_things import (
     PARTS_OF_A_THING,
     open_thumbs,
@@ -40,12 +40,11 @@ FRONT, HEAD, ABOVE = range(3)
 VIEW_SHARES = (0.68, 0.17, 0.15)
 HOLDING = 0.58
 """How many hands hold a thing, or try to."""
-FOREARM_PIECES = 6
-"""Ellipsoids of a forearm, the last one a cuff over the back of the hand."""
 UPRIGHT_THUMBS = 0.6
 """How many of those who put a thumb up hold it upright in the image; the others, any way."""
 _FOREARM_M = 0.25
-_ALONG = FOREARM_PIECES - 1
+_ALONG = 5
+"""Ellipsoids along a forearm; one more is a cuff over the back of the hand."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -294,9 +293,6 @@ def random_grasps(
     tip_angles, tip_parts, closing = things_between_tips(shape, radii, shifts, bare, dice)
     angles = torch.where(power[:, None], palm_angles, tip_angles)
     parts = torch.where(power[:, None, None], palm_parts, tip_parts)
-    others = torch.where(closing & (parts[:, 0, 0] >= 0), CLOSE, YIELD)[:, None].expand(n, 3)
-    tips = torch.cat((torch.full((n, 2), CLOSE), others), 1)
-    tasks = torch.where(power[:, None], torch.full((n, 5), CLOSE), tips)
     said = torch.zeros(n, 2, dtype=torch.float64)
     most = torch.tensor([35, 45, 15, 55, 60] + [0, 82, 100, 55] * 4) + 6.0 * dice.normal(n, 21)
     most = clamp_to_joint_limits(torch.deg2rad(most)).double()
@@ -308,7 +304,7 @@ def random_grasps(
         _doubles(thumbs),
         opposed.numpy(),
         most.numpy(),
-        tasks.contiguous().numpy(),
+        (power | closing).numpy(),
         power.numpy(),
         flesh.numpy(),
         tuple(map(_doubles, bones)),

@@ -18,7 +18,6 @@ from toftrack.training.furniture import before_camera, furniture, on_a_piece
 from toftrack.training.hands import (
     BACKGROUND,
     FOREARM,
-    FOREARM_PIECES,
     FRONT,
     HAND,
     OTHER_FOREARM,
@@ -125,8 +124,7 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     centre = torch.stack((torch.zeros(n), torch.zeros(n), distance), 1)
     known = ~dice.chance(NEW_HANDS, n)
     off = dice.chance(torch.where(known, _WRONG, 0.5), n)
-    spread = torch.where(off, _CENTRE_M[1], _CENTRE_M[0])
-    spread = torch.where(known, spread, torch.where(off, _NEW_CENTRE_M[1], _NEW_CENTRE_M[0]))
+    spread = torch.tensor((_NEW_CENTRE_M, _CENTRE_M))[known.int(), off.int()]
     near = spread[:, None] * dice.normal(n, 3)
     away = torch.nn.functional.normalize(dice.normal(n, 3), dim=1)
     away = away * dice.uniform(n, 1, low=0.13, high=0.30)
@@ -135,11 +133,9 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
     left = dice.chance(_LEFT, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
-    labels = hands.labels.clone()
     # Most of the crops about something else: there is no hand at all, only its arm, or nothing.
     gone = ~present & dice.chance(0.75, n)
-    pieces = labels.shape[1] - FOREARM_PIECES
-    labels[:, :pieces] = torch.where(gone[:, None], -1, labels[:, :pieces])
+    labels = _without(HAND, gone, hands.labels)
     other = other_hands(hands, bank, dice, touching=present)
     there = dice.chance(torch.where(present, *_OTHERS), n)
     scenes = random_scenes(hands, labels, (other, there), dice, objects=0.12, views=views)
@@ -175,6 +171,11 @@ def crop_images(n: int, bank: ShapeBank, generator: torch.Generator) -> Crops:
         log_size=hands.log_size,
         joints_m=(hands.joints_m - centre[:, None]) @ back,
     )
+
+
+def _without(label: int, gone: Tensor, labels: Tensor) -> Tensor:
+    """Labels (N, E), without those of one kind where it is gone (N,)."""
+    return torch.where(gone[:, None] & (labels == label), -1, labels)
 
 
 def _upright_angles(hands: Hands, wrong: Tensor, dice: Dice) -> Tensor:
@@ -221,13 +222,10 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
     left = dice.chance(0.5, n)
     views = random_views(n, dice)
     hands = posed_hands(bank, pivot, left, dice, HAND, views=views)
-    labels = hands.labels.clone()
     raised = ~dice.chance(_EMPTY, n)
-    pieces = labels.shape[1] - FOREARM_PIECES
-    labels[:, :pieces] = torch.where(raised[:, None], labels[:, :pieces], -1)
+    labels = _without(HAND, ~raised, hands.labels)
     # Without its hand, mostly no forearm is held up either.
-    no_arm = ~raised & dice.chance(0.7, n)
-    labels[:, pieces:] = torch.where(no_arm[:, None], -1, labels[:, pieces:])
+    labels = _without(FOREARM, ~raised & dice.chance(0.7, n), labels)
     other = other_hands(hands, bank, dice, touching=raised)
     there = dice.chance(0.35, n) & raised
     scenes = random_scenes(hands, labels, (other, there), dice, objects=0.15, views=views)

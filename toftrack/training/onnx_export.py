@@ -271,14 +271,11 @@ def _signed(model: Any, properties: dict[str, str]) -> bytes:
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
     """Within, nothing is said of how an export or a quantisation goes, nor of other packages."""
-    loggers = logging.getLogger(), logging.getLogger("torch.onnx")
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
     try:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
+        logging.disable(before)
