@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from helpers.tracking import configuration, make_tracker, sample
 
 from toftrack.api import build_hands_tracker
+from toftrack.compute import quality
 from toftrack.compute.quality import LEVELS, REDUCED, Pace, Timekeeper, pace_within
 from toftrack.compute.threads import at_most, threads
 from toftrack.errors import ToftrackError
@@ -28,6 +30,12 @@ def levels(pace: Pace, took_s: Iterable[float]) -> list[int]:
         pace = pace.after(seconds)
         found.append(pace.level)
     return found
+
+
+@pytest.fixture
+def ask(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], float]], None]:
+    """Give Timekeepers another clock."""
+    return lambda clock: monkeypatch.setattr(quality, "time", SimpleNamespace(perf_counter=clock))
 
 
 def slow(step_s: float) -> Callable[[], float]:
@@ -78,9 +86,10 @@ def test_a_budget_that_is_none_is_refused(budget_ms: object) -> None:
         pace_within(budget_ms)  # type: ignore[arg-type]
 
 
-def test_what_is_done_after_the_step_counts_and_waiting_does_not() -> None:
+def test_what_is_done_after_the_step_counts_and_waiting_does_not(ask) -> None:
     now = [0.0]
-    time = Timekeeper(Pace(BUDGET_S), lambda: now[0])
+    ask(lambda: now[0])
+    time = Timekeeper(Pace(BUDGET_S))
     for _ in range(30):
         time.begin()
         now[0] += 0.02
@@ -92,19 +101,20 @@ def test_what_is_done_after_the_step_counts_and_waiting_does_not() -> None:
     assert 0 < time.reduced < 30
 
 
-def test_a_frame_is_timed_from_when_its_raw_image_was_there() -> None:
-    time = Timekeeper(clock=lambda: 50.0)
+def test_a_frame_is_timed_from_when_its_raw_image_was_there(ask) -> None:
+    ask(lambda: 50.0)
+    time = Timekeeper(Pace())
     time.begin(began_s=49.5)
     assert time.took_s() == pytest.approx(0.5)
 
 
 def test_each_level_leaves_out_more() -> None:
     model = make_tracker("hand.side=right").model
-    for quality in LEVELS[:REDUCED]:
-        assert model.at_quality(quality) is model
+    for level in LEVELS[:REDUCED]:
+        assert model.at_quality(level) is model
     before = model
-    for quality in LEVELS[REDUCED:]:
-        less = model.at_quality(quality)
+    for level in LEVELS[REDUCED:]:
+        less = model.at_quality(level)
         assert less.detector.settings.every > before.detector.settings.every
         assert less.detector.settings.search > before.detector.settings.search
         assert less.filter == model.filter
@@ -120,11 +130,12 @@ def test_less_quality_may_be_one_thread() -> None:
         assert threads() == many
 
 
-def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
+def test_a_recording_is_tracked_alike_however_slow_the_machine_is(ask) -> None:
     scene, found = sample(), []
     for step_s in (0.001, 3.0):
         usual = make_tracker("hand.side=right")
-        tracker = Tracker(usual.model, clock=slow(step_s))
+        ask(slow(step_s))
+        tracker = Tracker(usual.model)
         estimates = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(5)]
         assert tracker.time.reduced == 0
         assert estimates[-1].compute_s >= step_s
@@ -133,9 +144,9 @@ def test_a_recording_is_tracked_alike_however_slow_the_machine_is() -> None:
 
 
 @pytest.mark.parametrize("hands", [1, 2])
-def test_a_slow_machine_still_tracks_with_less_quality(hands: int) -> None:
+def test_a_slow_machine_still_tracks_with_less_quality(hands: int, ask) -> None:
     usual = build_hands_tracker(configuration(f"hands={hands}", "tracker.budget_ms=33"))
-    usual.time = Timekeeper(usual.time.pace, slow(0.06))
+    ask(slow(0.06))
     scene = sample()
     for i in range(12):
         first, *_ = usual.step(scene.depth_m[i], scene.k, i, i / 25)

@@ -7,7 +7,6 @@ not alike; recordings are tracked with all effort, and stay reproducible.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from toftrack.errors import check_number
@@ -117,15 +116,11 @@ class Timekeeper:
     """Measures a tracker's frames, and says what may be spent on the next one.
 
     pace: as of the last frame.  reduced: frames from which something was left out.
-    clock: seconds that never go back.
     """
 
-    def __init__(
-        self, pace: Pace | None = None, clock: Callable[[], float] = time.perf_counter
-    ) -> None:
-        self.pace = pace or Pace()
+    def __init__(self, pace: Pace) -> None:
+        self.pace = pace
         self.reduced = 0
-        self._clock = clock
         self._began_s: float | None = None
         self._took_s = 0.0
 
@@ -133,12 +128,12 @@ class Timekeeper:
         """A frame begins, now or when it was there; what may be spent on it."""
         if self._began_s is not None:
             self.pace = self.pace.after(self._took_s)
-        self._began_s = self._clock() if began_s is None else began_s
+        self._began_s = time.perf_counter() if began_s is None else began_s
         self.reduced += self.pace.reduced
         return LEVELS[self.pace.level]
 
     def took_s(self) -> float:
         """Seconds since the frame began. It took as long as was said last before the next one."""
         if self._began_s is not None:
-            self._took_s = self._clock() - self._began_s
+            self._took_s = time.perf_counter() - self._began_s
         return self._took_s

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
@@ -38,14 +37,9 @@ class HandsTracker:
     """
 
     def __init__(
-        self,
-        model: FilterModel,
-        seed: int = 0,
-        hands: int = 1,
-        pace: Pace | None = None,
-        clock: Callable[[], float] = time.perf_counter,
+        self, model: FilterModel, seed: int = 0, hands: int = 1, pace: Pace | None = None
     ) -> None:
-        """pace: of a live device; None spends all effort on each frame.  clock: of `began_s`.
+        """pace: of a live device; None spends all effort on each frame.
 
         Raises ToftrackError when `hands` is no number of hands, or several without a detector.
         """
@@ -55,7 +49,7 @@ class HandsTracker:
                 f"hands={hands} needs networks to tell hands apart, and experiment=paper has none;"
                 " give hands=1, or leave experiment=paper out"
             )
-        self.model, self.time = model, Timekeeper(pace, clock)
+        self.model, self.time = model, Timekeeper(pace or Pace())
         self.state = model.first_state(seed, hands)
         self.infos: tuple[StepInfo | None, ...] = (None,) * hands
 
@@ -151,14 +145,8 @@ class HandsTracker:
 class Tracker:
     """Follows one hand: the only slot of a HandsTracker, `hands`, which says more of each part."""
 
-    def __init__(
-        self,
-        model: FilterModel,
-        seed: int = 0,
-        pace: Pace | None = None,
-        clock: Callable[[], float] = time.perf_counter,
-    ) -> None:
-        self.hands = HandsTracker(model, seed, 1, pace, clock)
+    def __init__(self, model: FilterModel, seed: int = 0, pace: Pace | None = None) -> None:
+        self.hands = HandsTracker(model, seed, 1, pace)
 
     def step(
         self,
