@@ -85,17 +85,12 @@ def fit_confidence(asked: argparse.Namespace) -> None:
     asked.output.mkdir(parents=True, exist_ok=True)
     generator = torch.Generator().manual_seed(asked.seed)
     bank = shape_bank(400, generator)
-    numbers = tqdm(range(asked.sequences), unit=" sequences", file=sys.stderr)
-    parts = [
-        observed(
-            random_sequence(asked.frames, bank, generator),
-            asked.overrides,
-            asked.seed + number,
-            number,
-        )
-        for number in numbers
-    ]
-    found = [part for part in parts if part is not None]
+    found = []
+    for number in tqdm(range(asked.sequences), unit=" sequences", file=sys.stderr):
+        sequence = random_sequence(asked.frames, bank, generator)
+        part = observed(sequence, asked.overrides, asked.seed + number, number)
+        if part is not None:
+            found.append(part)
     if len({int(part.sequence[0]) % _HELD_OUT == 0 for part in found}) < 2:
         raise ToftrackError(
             f"of {asked.sequences} sequences the tracker saw a hand in {len(found)}, too few to fit"

@@ -153,10 +153,9 @@ def posed_hands(
     shape, surface = bank.rows(rows)
     size = bank.log_size[rows].exp()
     parts = torch.zeros(n, 0, PART)
-    free = torch.zeros(n, dtype=torch.bool) if known is None else ~known
+    free = torch.full((n,), angles is None) if known is None else ~known
     if angles is None or known is not None:
         own = shown_poses(n, dice)
-        free = torch.ones_like(free) if angles is None else free
         angles = own if angles is None else torch.where(free[:, None], own, angles)
     shape, surface = cupped(shape, surface, angles, bank.log_size[rows], dice)
     if bool(free.any()):

@@ -91,15 +91,13 @@ def train(config: DictConfig) -> float:
         if schedule.restart_images > 0 and schedule.images > 0:
             about[f"{name}_restart_images"] = schedule.restart_images
     save_weights(path, pose_network, finder_network, about)
-    pictures = ["images.png"]
-    if pose_course:
-        write_picture(folder / "course.png", course_figure(pose_course))
-        pictures.append("course.png")
     summary = about | {"poses": pose_course, "finder": finder_course}
     write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
     derived = [] if missing else [file.name for file in export_networks(path)]
-    error_mm, learned = math.nan, ""
+    error_mm, learned, pictures = math.nan, "", ["images.png"]
     if pose_course:
+        write_picture(folder / "course.png", course_figure(pose_course))
+        pictures.append("course.png")
         last = pose_course[-1]
         error_mm = float(last["keypoints_mm"])
         learned = (
