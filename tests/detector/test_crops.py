@@ -24,7 +24,7 @@ from toftrack.detector.crops import (
     crop_rotation,
     wide,
 )
-from toftrack.detector.detection import Detection, doubted_sigma_m
+from toftrack.detector.detection import OF_HYPOTHESES, Detection, doubted_sigma_m
 from toftrack.detector.hand_detector import HandDetector
 from toftrack.detector.network import STRIDE, Finder, Found, PoseNet
 from toftrack.detector.proposals import KEPT
@@ -37,12 +37,9 @@ PLACES = [(0.0, 0.0, 0.45), (0.198, 0.0, 0.45), (0.0, -0.16, 0.45)]  # the other
 PLACES += [(2.0, 0.0, 0.3), (0.0, 0.0, 0.01), (-5.0, 3.0, 0.2)]  # and beyond it
 
 
-HYPOTHESES = "pivot_m rotvec angles joints_m log_size log_probability error_m".split()
-
-
 def numbers(seen: list[Detection]) -> dict[str, torch.Tensor]:
     """(C, ...) of C detections."""
-    values = {name: torch.stack([getattr(one, name) for one in seen]) for name in HYPOTHESES}
+    values = {name: torch.stack([getattr(one, name) for one in seen]) for name in OF_HYPOTHESES}
     values["keypoints_m"] = torch.stack([one.keypoints.points_m for one in seen])
     values["sigma_m"] = torch.stack([one.keypoints.sigma_m for one in seen])
     values["present"] = torch.tensor([one.present for one in seen])

@@ -52,15 +52,7 @@ Network = TypeVar("Network", PoseNet, Finder)
 
 @dataclass(frozen=True)
 class Schedule:
-    """How a network is trained; see conf/train_detector.yaml.
-
-    images: before a restart; 0 leaves the weights of `start` as they are.
-    batch: images of a step.  rate: the highest learning rate, see rate_at.
-    width: channels of the network's first layer.
-    start: a file of weights to go on from; None begins from nothing.
-    restart_images: seen after `images`, while the rate rises again and falls; the result is the
-        mean of both ends; 0 = no restart.  restart_rate: the highest learning rate meanwhile.
-    """
+    """How a network is trained; see conf/train_detector.yaml for what each does."""
 
     images: int
     batch: int

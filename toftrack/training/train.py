@@ -6,7 +6,6 @@ import json
 import math
 import os
 from pathlib import Path
-from typing import Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -19,13 +18,6 @@ from toftrack.errors import ToftrackError, check_number
 from toftrack.files.safe_files import write_whole
 from toftrack.programs.command_line import sweep_job
 from toftrack.views.pictures import write_picture
-
-
-def _schedule(config: DictConfig, name: str) -> Any:
-    try:
-        return hydra.utils.instantiate(config[name])
-    except HydraException as error:
-        raise ToftrackError(f"{name}: {sentence(error)}") from None
 
 
 @sweep_job
@@ -62,10 +54,15 @@ def train(config: DictConfig) -> float:
             f"output={config.output} is not possible; give a name that ends in .npz, in a folder "
             "that exists"
         )
-    poses, finder = (_schedule(config, name) for name in ("poses", "finder"))
-    for schedule in (poses, finder):
-        if schedule.start is not None:
-            load_weights(schedule.start)  # an error now, not after hours
+    schedules = []
+    for name in ("poses", "finder"):
+        try:
+            schedules.append(hydra.utils.instantiate(config[name]))
+        except HydraException as error:
+            raise ToftrackError(f"{name}: {sentence(error)}") from None
+        if schedules[-1].start is not None:
+            load_weights(schedules[-1].start)  # an error now, not after hours
+    poses, finder = schedules
     check_number("shapes", config.shapes, 1, whole=True)
     check_number("checkpoint_minutes", config.checkpoint_minutes, 0, above=True)
     resume = None if config.resume is None else Path(to_absolute_path(config.resume))
