@@ -38,9 +38,8 @@ def furniture(there: Tensor, middle: Tensor, dice: Dice) -> Tensor:
     which = torch.multinomial(often, 1, generator=dice.generator)[:, 0]
     pieces = kinds[which, torch.arange(n)]
     some = dice.uniform(n, 1, low=2, high=PIECES + 1).floor()
-    pieces[..., 0] = torch.where(
-        (torch.arange(PIECES) < some) & there[:, None], pieces[..., 0], -1.0
-    )
+    shown = (torch.arange(PIECES) < some) & there[:, None]
+    pieces[..., 0] = torch.where(shown, pieces[..., 0], -1.0)
     return pieces
 
 

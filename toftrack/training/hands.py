@@ -243,14 +243,9 @@ def _forearms(
     # A cuff reaches over the hand, to the knuckles at most.
     reach = dice.uniform(n, high=0.045) * size
     cuff = rotation @ torch.tensor([0.0, -1.0, -0.1]) * reach[:, None]
-    over = torch.stack(
-        (
-            dice.uniform(n, low=0.040, high=0.052) * size,
-            0.045 * size,
-            dice.uniform(n, low=0.022, high=0.034) * size,
-        ),
-        1,
-    )
+    wide = dice.uniform(n, low=0.040, high=0.052)
+    thick = dice.uniform(n, low=0.022, high=0.034)
+    over = torch.stack((wide, torch.full((n,), 0.045), thick), 1) * size[:, None]
     centres = torch.cat((centres, cuff[:, None]), 1)
     axes = torch.cat((axes, (rotation * over[:, None])[:, None]), 1)
     # Without an arm (cut off by a dark sleeve, say) only the first piece is left, or not even that.

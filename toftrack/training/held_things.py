@@ -93,10 +93,9 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     zero = torch.zeros(n)
     oblique = torch.deg2rad(18.0 * dice.normal(n) + 8.0)
     lean = 0.15 * dice.normal(n)
-    y = torch.stack((oblique.cos(), oblique.sin(), lean), 1)
-    y = torch.nn.functional.normalize(
-        y * torch.where(dice.chance(0.5, n), 1.0, -1.0)[:, None], dim=1
-    )
+    way = torch.where(dice.chance(0.5, n), 1.0, -1.0)[:, None]
+    y = way * torch.stack((oblique.cos(), oblique.sin(), lean), 1)
+    y = torch.nn.functional.normalize(y, dim=1)
     z = torch.linalg.cross(y, torch.nn.functional.normalize(dice.normal(n, 3), dim=1))
     z = torch.nn.functional.normalize(z, dim=1)
     rows = torch.stack((torch.linalg.cross(y, z), y, z), 1)
@@ -178,9 +177,8 @@ def things_in_palms(size: Tensor, dice: Dice) -> tuple[Tensor, Tensor]:
     spread = torch.tensor([12.0, 2.0, -8.0, -16.0]) * dice.uniform(n, 1, low=-1.8, high=0.8)
     fingers[..., 0] += spread
     angles = torch.cat((torch.zeros(n, 5), fingers.flatten(1)), 1)
-    return clamp_to_joint_limits(torch.deg2rad(angles)), _chosen(
-        [things[name] for name in IN_PALM], which
-    )
+    held = _chosen([things[name] for name in IN_PALM], which)
+    return clamp_to_joint_limits(torch.deg2rad(angles)), held
 
 
 def open_thumbs(n: int, tries: int, dice: Dice) -> Tensor:

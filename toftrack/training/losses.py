@@ -60,10 +60,8 @@ def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> tuple[Tensor, dic
     rotation, angles, log_size, pivot, expected = (
         _rows(part, rows) for part in (p.rotation, p.angles, p.log_size, p.pivot_m, p.error_m)
     )
-    joints = hypothesis_joints(
-        *(part.flatten(0, 1) for part in (rotation, angles, log_size, pivot))
-    )
-    joints = joints.unflatten(0, (len(there), _POSED))
+    poses = (part.flatten(0, 1) for part in (rotation, angles, log_size, pivot))
+    joints = hypothesis_joints(*poses).unflatten(0, (len(there), _POSED))
     distance = (joints - crops.joints_m[:, None]).norm(dim=-1)  # (N, P, 21)
     bent = (angles - crops.angles[:, None]).abs().mean(2)
     size = (log_size - crops.log_size[:, None]).abs()
@@ -136,14 +134,8 @@ def finder_loss(found: Found, images: WideImages) -> Tensor:
             true = torch.stack((column[b] - c, row[b] - r, images.depth_m[b, hand].log()))
             across, down, log_depth = on_device(true, device).unbind(0)
             here = on_device(at, device).unbind(1)
-            places = (
-                places
-                + (
-                    (found.column[here] - across).abs()
-                    + (found.row[here] - down).abs()
-                    + 10 * (found.log_depth[here] - log_depth).abs()
-                ).sum()
-            )
+            beside = (found.column[here] - across).abs() + (found.row[here] - down).abs()
+            places = places + (beside + 10 * (found.log_depth[here] - log_depth).abs()).sum()
     count = int((target == 1).sum().clamp(min=1))
     target, ignored = on_device(target, device), on_device(ignored, device)
     positive = target == 1

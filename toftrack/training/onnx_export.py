@@ -63,9 +63,7 @@ def example_images() -> np.ndarray:
     """(CALIBRATION + COMPARED, 2, H, W) float32 of what the finder sees, the same every time."""
     generator = torch.Generator().manual_seed(_SEED)
     bank, count = shape_bank(_SHAPES, generator), (CALIBRATION + COMPARED) // _BATCH
-    return np.concatenate(
-        [wide_images(_BATCH, bank, generator).image.numpy() for _ in range(count)]
-    )
+    return torch.cat([wide_images(_BATCH, bank, generator).image for _ in range(count)]).numpy()
 
 
 def quantised(model: Any, images: np.ndarray) -> Any:
@@ -107,9 +105,8 @@ def compare(network: PoseNet | Finder, model: Any, images: np.ndarray) -> None:
     shown = torch.from_numpy(images)
     with torch.inference_mode():
         if isinstance(network, Finder):
-            expected = dict(
-                zip(Found._fields, zip(found, network(shown), strict=True), strict=True)
-            )
+            both = zip(found, network(shown), strict=True)
+            expected = dict(zip(Found._fields, both, strict=True))
         else:
             heads, *maps = network.features(shown)
             joints = network.decode(shown, heads, *maps).joints_m

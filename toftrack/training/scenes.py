@@ -103,9 +103,8 @@ def surroundings(hands: Hands, dice: Dice, views: Tensor) -> tuple[Tensor, Tenso
 def _along(direction: Tensor, radius: Tensor, half_length: Tensor) -> Tensor:
     """(N, 3, 3) semi-axes of ellipsoids of revolution along (N, 3)."""
     y = torch.nn.functional.normalize(direction, dim=1)
-    helper = torch.where(
-        (y[:, :1].abs() < 0.7), torch.tensor([1.0, 0.0, 0.0]), torch.tensor([0.0, 0.0, 1.0])
-    )
+    across, _, away = torch.eye(3)
+    helper = torch.where(y[:, :1].abs() < 0.7, across, away)
     x = torch.nn.functional.normalize(torch.linalg.cross(y, helper), dim=1)
     z = torch.linalg.cross(x, y)
     scales = torch.stack((radius, half_length, radius), 1)
@@ -145,9 +144,8 @@ def background_behind(behind_m: Tensor, dice: Dice) -> Tensor:
     table = torch.nn.functional.normalize(table, dim=1)
     below = dice.uniform(n, low=0.12, high=0.4)
     below = torch.where(dice.chance(0.15, n), below, torch.inf)
-    return torch.stack(
-        (torch.cat((wall, distance[:, None]), 1), torch.cat((table, below[:, None]), 1)), 1
-    )
+    planes = torch.cat((wall, distance[:, None]), 1), torch.cat((table, below[:, None]), 1)
+    return torch.stack(planes, 1)
 
 
 def tables_under(hands: Hands, views: Tensor, dice: Dice) -> Tensor:
