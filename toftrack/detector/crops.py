@@ -160,19 +160,11 @@ def _wide_grid(size: tuple[int, int], entries: bytes) -> tuple[np.ndarray, np.nd
     focal = np.minimum(WIDE_F_PX, k.diagonal()[:2] * WIDE_LARGEST_PX / (width, height))
     scale = focal / k.diagonal()[:2]
     # A multiple, for the network's strides; what is added has no reading.
-    w, h = (
-        WIDE_MULTIPLE * int(np.ceil(s * f / WIDE_MULTIPLE - 1e-9))
-        for s, f in zip((width, height), scale, strict=True)
-    )
+    w, h = WIDE_MULTIPLE * np.ceil(scale * (width, height) / WIDE_MULTIPLE - 1e-9).astype(int)
     columns = np.rint((np.arange(w) + 0.5) / scale[0] - 0.5).astype(int)
     rows = np.rint((np.arange(h) + 0.5) / scale[1] - 0.5).astype(int)
-    new_k = np.array(
-        [
-            [focal[0], 0, (k[0, 2] + 0.5) * scale[0] - 0.5],
-            [0, focal[1], (k[1, 2] + 0.5) * scale[1] - 0.5],
-            [0, 0, 1],
-        ]
-    )
+    new_k = np.diag((*focal, 1.0))
+    new_k[:2, 2] = (k[:2, 2] + 0.5) * scale - 0.5
     return rows, columns, new_k
 
 

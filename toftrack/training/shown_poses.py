@@ -266,8 +266,6 @@ def touching_pairs() -> tuple[tuple[Tensor, Tensor], ...]:
     joints = forward_kinematics(state, default_hand_shape()).joints_m
     found = []
     for finger in range(4):
-        rows = ((joints[:, 8 + 4 * finger] - joints[:, 4]).norm(dim=1) < _TOUCHING_M).nonzero()[
-            :, 0
-        ]
-        found.append((thumb[rows], fingers[rows]))
+        near = (joints[:, 8 + 4 * finger] - joints[:, 4]).norm(dim=1) < _TOUCHING_M
+        found.append((thumb[near], fingers[near]))
     return tuple(found)
