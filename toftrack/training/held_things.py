@@ -297,13 +297,12 @@ def _pads(
 @functools.cache
 def _opposed_pairs() -> tuple[Tensor, Tensor]:
     """Thumbs (P, 5) and index fingers (P, 4) whose pads face each other, the nearest first."""
-    generator = torch.Generator().manual_seed(0)
-    n = 200_000
+    n, dice = 200_000, Dice(torch.Generator().manual_seed(0))
     low, high = torch.tensor(ANGLE_LIMITS)[:5].unbind(1)
-    thumb = low + (high - low) * torch.rand(n, 5, generator=generator)
+    thumb = low + (high - low) * dice.uniform(n, 5)
     thumb[:, 3:] = thumb[:, 3:].clamp(min=-0.1, max=0.9)
-    bent = torch.tensor([75.0, 70.0, 40.0]) * torch.rand(n, 3, generator=generator)
-    finger = torch.cat((7.0 * torch.randn(n, 1, generator=generator), bent), 1).deg2rad()
+    bent = torch.tensor([75.0, 70.0, 40.0]) * dice.uniform(n, 3)
+    finger = torch.cat((7.0 * dice.normal(n, 1), bent), 1).deg2rad()
     state = torch.cat((torch.zeros(n, 6), thumb, finger, torch.zeros(n, 12)), 1)
     radii = torch.full((n, 5, 3), 0.0075)
     radii[:, 0] = 0.009

@@ -79,7 +79,7 @@ _TOUCHING = 0.4
 """How many second hands are beside the first and touch it, before or behind it."""
 _TWINS = 0.6
 """How many of those show its mirror image."""
-_HAND_M2 = 0.0105
+HAND_M2 = 0.0105
 """About what a mean adult's hand covers from most sides."""
 
 
@@ -239,7 +239,7 @@ def wide_images(n: int, bank: ShapeBank, generator: torch.Generator) -> WideImag
         at = one.pivot_m[:, :2] / one.pivot_m[:, 2:] * WIDE_F_PX
         at = at + torch.stack((lens.cx, lens.cy), 1)
         cells.append((at + 0.5) / STRIDE - 0.5)
-        expected = _HAND_M2 * (2 * one.log_size).exp() * (WIDE_F_PX / one.pivot_m[:, 2]) ** 2
+        expected = HAND_M2 * (2 * one.log_size).exp() * (WIDE_F_PX / one.pivot_m[:, 2]) ** 2
         part = ((shown == label) & (depth > 0)).sum((1, 2)) / expected
         seen.append(torch.where(exists, part, torch.zeros(n)))
     return WideImages(

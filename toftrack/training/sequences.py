@@ -16,7 +16,7 @@ from torch import Tensor
 
 from toftrack.training.dice import Dice
 from toftrack.training.hands import HAND, posed_hands, random_rotations, random_views
-from toftrack.training.images import FURNISHED, furnished, other_hands, random_scenes
+from toftrack.training.images import FURNISHED, HAND_M2, furnished, other_hands, random_scenes
 from toftrack.training.pictures import Lens, random_sensors, take_pictures
 from toftrack.training.shapes import ShapeBank
 from toftrack.training.shown_poses import shown_poses
@@ -84,7 +84,7 @@ def random_sequence(frames: int, bank: ShapeBank, generator: torch.Generator) ->
         depth, which = take_pictures(scenes, lens, sensor, (height, width), dice)
         images.append(depth[0])
         joints.append(hands.joints_m[0])
-        area = (focal / float(pivot[2])) ** 2 * 0.0105 * math.exp(2 * float(hands.log_size))
+        area = (focal / float(pivot[2])) ** 2 * HAND_M2 * math.exp(2 * float(hands.log_size))
         seen.append((which == HAND).sum() / area > 0.1)
     side = "left" if bool(left) else "right"
     return Sequence(np.stack(images), k, torch.stack(joints).numpy(), np.array(seen), side)
