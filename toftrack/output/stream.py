@@ -199,7 +199,8 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
     one = isinstance(fields, str) or not isinstance(fields, Sequence)
     names: tuple[Any, ...] = (fields,) if one else tuple(fields)
     if not names:
-        raise ToftrackError("stream.fields is empty; give names of fields, or null for all")
+        some = ", ".join(LINE_FIELDS)
+        raise ToftrackError(f"stream.fields is empty; give some of {some}, or null for all")
     for name in names:
         check_choice("stream.fields", name, LINE_FIELDS, ", or null for all")
     return names
