@@ -24,15 +24,14 @@ START_NS = 1_700_000_000_000_000_000
 
 @dataclass
 class Message:
-    """What is written: a topic, a type, the fields beside the header, and times."""
+    """What is written: a topic, a type, the fields beside the header, and when it is recorded: 7 ms
+    after its stamp.
+    """
 
     topic: str
     kind: str
     fields: dict[str, Any]
     recorded_ns: int
-    stamp_ns: int | None = None
-    """None = 7 ms before it is recorded."""
-    frame_id: str = "depth"
 
 
 def write_bag(folder: Path, kind: str, messages: Iterable[Message]) -> Path:
@@ -67,7 +66,7 @@ def write_bag(folder: Path, kind: str, messages: Iterable[Message]) -> Path:
 
 
 def _message(types: Any, message: Message, one: bool) -> Any:
-    stamp_ns = message.recorded_ns - 7_000_000 if message.stamp_ns is None else message.stamp_ns
+    stamp_ns = message.recorded_ns - 7_000_000
     time = types.types["builtin_interfaces/msg/Time"](*divmod(stamp_ns, 10**9))
     header = {"seq": 0} if one else {}
     header_type = types.types["std_msgs/msg/Header"]
@@ -76,18 +75,18 @@ def _message(types: Any, message: Message, one: bool) -> Any:
         fields["roi"] = types.types["sensor_msgs/msg/RegionOfInterest"](**fields["roi"])
         if not one:
             fields = {key.lower() if len(key) == 1 else key: v for key, v in fields.items()}
-    whole = header_type(**header, stamp=time, frame_id=message.frame_id)
+    whole = header_type(**header, stamp=time, frame_id="depth")
     return types.types[message.kind](header=whole, **fields)
 
 
-def recorded_ns(number: int, fps: float = 25.0) -> int:
+def recorded_ns(number: int) -> int:
     """When the frame of that number is recorded."""
-    return START_NS + round(number * 1e9 / fps)
+    return START_NS + round(number * 1e9 / 25)
 
 
 def image(depth: np.ndarray, encoding: str = "16UC1", big: bool = False, pad: int = 0) -> dict:
     """The fields of an Image of depths in metres; `pad` bytes follow each row."""
-    kind = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4", "rgb8": "u1"}[encoding]
+    kind = {"16UC1": "u2", "32FC1": "f4", "rgb8": "u1"}[encoding]
     words = np.rint(1000 * depth.astype(float)) if kind == "u2" else depth
     rows = np.ascontiguousarray(words.astype(np.dtype(kind).newbyteorder(">" if big else "<")))
     data = rows.view(np.uint8).reshape(len(depth), -1)
@@ -158,25 +157,21 @@ def camera_info(camera: Camera, model: str = "plumb_bob", **changes: Any) -> dic
 
 
 def recording(
-    depth: Sequence[np.ndarray],
-    camera: Camera,
-    encoding: str = "16UC1",
-    info_at: int = 0,
-    fps: float = 25.0,
+    depth: Sequence[np.ndarray], camera: Camera, encoding: str = "16UC1", info_at: int = 0
 ) -> list[Message]:
     """Images and their camera_info, which comes before the image `info_at`."""
     messages = []
     for number, frame in enumerate(depth):
+        at = recorded_ns(number)
         if number == info_at:
-            fields = camera_info(camera)
-            messages.append(Message(INFO, CAMERA_INFO, fields, recorded_ns(number, fps)))
+            messages.append(Message(INFO, CAMERA_INFO, camera_info(camera), at))
         if "compressedDepth" in encoding:
-            fields, kind, topic = (
-                compressed(frame, encoding),
-                COMPRESSED,
+            topic, kind, fields = (
                 f"{DEPTH}/compressedDepth",
+                COMPRESSED,
+                compressed(frame, encoding),
             )
         else:
-            fields, kind, topic = image(frame, encoding), IMAGE, DEPTH
-        messages.append(Message(topic, kind, fields, recorded_ns(number, fps)))
+            topic, kind, fields = DEPTH, IMAGE, image(frame, encoding)
+        messages.append(Message(topic, kind, fields, at))
     return messages

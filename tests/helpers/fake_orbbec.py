@@ -86,7 +86,7 @@ class Camera:
         self, serial: str, profiles: dict[str, list[Getters]], sets: Sequence[Images] = ()
     ) -> None:
         self.serial, self.profiles, self.sets = serial, profiles, list(sets)
-        self.plugged, self.begun = True, threading.Event()
+        self.plugged = True
         self.started: list[Getters] = []
 
     def get_device_info(self) -> Getters:
@@ -157,7 +157,6 @@ class Sdk(SimpleNamespace):
                     if self._stopped.is_set():
                         return
                     callback(images)
-                self._camera.begun.set()
 
             def stop(self) -> None:
                 self._stopped.set()

@@ -12,6 +12,7 @@ import av
 import cv2
 import numpy as np
 
+FPS = 25
 START_OFFSET_S = 0.5
 """Of the camera's clock in `write_kinect`."""
 RATIONAL = (0.55, -0.02, 1e-3, -2e-3, -0.0027, 0.89, 0.086, -0.014)
@@ -46,8 +47,6 @@ def write_kinect(
     depth_mm: np.ndarray,
     infrared: np.ndarray | None = None,
     about: dict | bytes | None = None,
-    fps: int = 25,
-    titles: tuple[str, str] = ("DEPTH", "IR"),
 ) -> Path:
     """(T, H, W) uint16 images as k4arecorder writes them; `about` becomes calibration.json."""
     container = av.open(str(path), "w", options={"allow_raw_vfw": "1"})
@@ -58,16 +57,14 @@ def write_kinect(
             "K4A_DEVICE_SERIAL_NUMBER": "0042",
         }
     )
-    streams = [_grey(container, "rawvideo", "gray16be", depth_mm.shape, fps)]
-    if infrared is not None:
-        streams.append(_grey(container, "rawvideo", "gray16be", infrared.shape, fps))
-    for stream, title in zip(streams, titles, strict=False):
+    images = [depth_mm] if infrared is None else [depth_mm, infrared]
+    streams = [_grey(container, "rawvideo", "gray16be", each.shape) for each in images]
+    for stream, title in zip(streams, ("DEPTH", "IR"), strict=False):
         stream.metadata["title"] = title
     if about is not None:
         text = about if isinstance(about, bytes) else json.dumps(about).encode() + b"\0\0"
         container.add_attachment("calibration.json", "application/octet-stream", text)
-    images = [depth_mm] if infrared is None else [depth_mm, infrared]
-    _encode(container, streams, images, fps)
+    _encode(container, streams, images)
     # The muxer has forgotten which kind of raw images they are, and turns them upside down.
     height, width = depth_mm.shape[1:]
     wrong = struct.pack("<IiiHHI", 40, width, -height, 1, 16, 0)
@@ -79,29 +76,27 @@ def write_kinect(
 
 
 def write_grey(
-    path: Path, words: np.ndarray, codec: str = "ffv1", pixels: str = "gray16le", fps: int = 25
+    path: Path, words: np.ndarray, codec: str = "ffv1", pixels: str = "gray16le"
 ) -> Path:
     """(T, H, W) uint16 images as a lossless grey video."""
     container = av.open(str(path), "w")
-    _encode(container, [_grey(container, codec, pixels, words.shape, fps)], [words], fps)
+    _encode(container, [_grey(container, codec, pixels, words.shape)], [words])
     return path
 
 
-def _grey(container: Any, codec: str, pixels: str, shape: tuple[int, ...], fps: int) -> Any:
-    stream = container.add_stream(codec, rate=fps)
+def _grey(container: Any, codec: str, pixels: str, shape: tuple[int, ...]) -> Any:
+    stream = container.add_stream(codec, rate=FPS)
     stream.height, stream.width = shape[1:]
     stream.pix_fmt = pixels
     return stream
 
 
-def _encode(container: Any, streams: list[Any], images: list[np.ndarray], fps: int) -> None:
-    for number in range(len(images[0])):
-        for stream, all_images in zip(streams, images, strict=True):
-            if number < len(all_images):
-                image = np.ascontiguousarray(all_images[number])
-                frame = av.VideoFrame.from_ndarray(image, stream.pix_fmt)
-                frame.pts, frame.time_base = number, Fraction(1, fps)
-                container.mux(stream.encode(frame))
+def _encode(container: Any, streams: list[Any], images: list[np.ndarray]) -> None:
+    for number, together in enumerate(zip(*images, strict=True)):
+        for stream, image in zip(streams, together, strict=True):
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), stream.pix_fmt)
+            frame.pts, frame.time_base = number, Fraction(1, FPS)
+            container.mux(stream.encode(frame))
     for stream in streams:
         container.mux(stream.encode())
     container.close()
