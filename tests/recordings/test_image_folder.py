@@ -72,9 +72,8 @@ def test_a_folder_is_tracked_with_the_lens_that_the_command_line_tells(
 
 @pytest.mark.parametrize("given", ["[200,200,88]", "[-1,200,88,72]", "200", "[1,1,88,72]"])
 def test_lenses_that_are_none_are_reported(given: str, folder: Path) -> None:
-    with pytest.raises(ToftrackError, match="intrinsics|of 176x144 pixels") as caught:
+    with pytest.raises(ToftrackError, match="intrinsics|of 176x144 pixels"):
         make_device("device=folder", f"device.path='{folder}'", f"device.intrinsics={given}")
-    assert "\n" not in str(caught.value)
 
 
 def test_a_lens_is_reported_once(folder: Path) -> None:

@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -18,11 +19,9 @@ from scipy.io import savemat
 
 from toftrack.api import make_device
 from toftrack.errors import ToftrackError
-from toftrack.programs import convert
 from toftrack.recordings import matlab, stacks
 from toftrack.recordings.bare import Given
 from toftrack.recordings.frame_store import FrameStore
-from toftrack.recordings.npz import read_recording
 from toftrack.recordings.store import ELSEWHERE, open_recording
 
 COUNT, HEIGHT, WIDTH = 5, 24, 32
@@ -157,9 +156,8 @@ def test_a_npy_whose_header_lies_is_reported(tmp_path: Path, shape: str) -> None
     text = f"{{'descr': '<u2', 'fortran_order': False, 'shape': {shape}\n".encode()
     header = b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
     (tmp_path / "a.npy").write_bytes(header + bytes(4608))
-    with pytest.raises(ToftrackError, match="a.npy' cannot be read") as caught:
+    with pytest.raises(ToftrackError, match="a.npy' cannot be read"):
         opened(tmp_path / "a.npy")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("write", [hdf5, mat], ids=["h5", "mat"])
@@ -180,9 +178,6 @@ def test_dataset_unit_and_rate_are_given_on_the_command_line(tmp_path: Path) -> 
         first = next(iter(device))
     assert device.fps == 50
     np.testing.assert_allclose(first.depth, METRES[0] / 2, atol=1e-6)
-    out, numbers = str(tmp_path / "out.npz"), "40 40 15.5 11.5".split()
-    convert.main([str(path), out, "--dataset", "depth", "--intrinsics", *numbers])
-    np.testing.assert_allclose(read_recording(out).image(2)[0], METRES[2], atol=1e-6)
 
 
 def directory(width: int, height: int, following: int = 0, tile: int = 0) -> bytes:
@@ -218,18 +213,11 @@ def test_a_chunk_of_hdf5_is_unpacked_once_for_all_its_images(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     stack = opened(hdf5(tmp_path / "a.h5", depth=WORDS))
-    reads: list[Any] = []
-    kind = h5py().Dataset
-    read = kind.__getitem__
-
-    def counted(dataset: Any, at: Any) -> Any:
-        reads.append(at)
-        return read(dataset, at)
-
-    monkeypatch.setattr(kind, "__getitem__", counted)
+    read = Mock(wraps=h5py().Dataset.__getitem__)
+    monkeypatch.setattr(h5py().Dataset, "__getitem__", lambda *given: read(*given))
     for number in range(COUNT):
         np.testing.assert_allclose(stack.image(number)[0], METRES[number], rtol=1e-6)
-    assert len(reads) <= 1
+    assert read.call_count <= 1
 
 
 def test_an_image_of_a_tiff_is_read_without_those_before_it(tmp_path: Path) -> None:

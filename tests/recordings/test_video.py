@@ -29,6 +29,12 @@ FEMTO = "CALIBRATION_LensDistortionModelRational6KT"
 REPORTED = Given((30.0, 31.0, 15.5, 11.5))
 
 
+def broken(change: Callable[[dict], Any]) -> dict:
+    about = calibration(K, 512, (96, 90))
+    change(about["CalibrationInformation"]["Cameras"][1])
+    return about
+
+
 def words(count: int = 7, size: tuple[int, int] = (24, 32)) -> np.ndarray:
     return np.random.default_rng(count).integers(0, 0x10000, (count, *size)).astype(np.uint16)
 
@@ -55,32 +61,23 @@ def test_a_kinects_recording_gives_depth_infrared_and_times(
 
 
 @pytest.mark.parametrize(
-    ("size", "across", "corner"),
+    ("size", "about"),
     [
-        ((320, 288), 512, (96, 90)),
-        ((640, 576), 1024, (192, 180)),
-        ((512, 512), 512, (0, 0)),
-        ((1024, 1024), 1024, (0, 0)),
+        ((320, 288), ABOUT),
+        ((640, 576), calibration(K, 1024, (192, 180))),
+        ((512, 512), calibration(K, 512, (0, 0))),
+        ((1024, 1024), calibration(K, 1024, (0, 0))),
+        ((320, 288), broken(lambda c: c["Intrinsics"].update(ModelType=FEMTO))),
     ],
 )
-def test_every_mode_of_a_kinect_has_its_part_of_the_lens(
-    tmp_path: Path, size: tuple[int, int], across: int, corner: tuple[int, int]
+def test_every_mode_of_a_kinect_and_a_femto_has_its_part_of_the_lens(
+    tmp_path: Path, size: tuple[int, int], about: dict
 ) -> None:
-    about = calibration(K, across, corner)
     path = write_kinect(tmp_path / "a.mkv", np.ones((1, *size[::-1]), np.uint16), about=about)
     camera = open_recording(path).camera
     np.testing.assert_allclose(camera.K, K, atol=1e-9)
     np.testing.assert_allclose(camera.distortion, RATIONAL)
     assert (camera.width, camera.height) == size
-
-
-def test_a_femtos_calibration_names_the_lens_otherwise(tmp_path: Path) -> None:
-    about = broken(lambda c: c["Intrinsics"].update(ModelType=FEMTO))
-    camera = open_recording(
-        write_kinect(tmp_path / "a.mkv", np.ones((1, 288, 320), np.uint16), about=about)
-    ).camera
-    np.testing.assert_allclose(camera.K, K, atol=1e-9)
-    np.testing.assert_allclose(camera.distortion, RATIONAL)
 
 
 @pytest.mark.parametrize("share", [0.5, 0.95])
@@ -95,12 +92,6 @@ def test_a_kinects_recording_that_was_cut_off_is_used_so_far(
     frames = list(Replay(path))
     assert len(frames) == len(store) == pytest.approx(share * 21, abs=1.01)
     np.testing.assert_allclose(frames[-1].depth, depth[len(frames) - 1] / 1000, rtol=1e-6)
-
-
-def broken(change: Callable[[dict], Any]) -> dict:
-    about = calibration(K, 512, (96, 90))
-    change(about["CalibrationInformation"]["Cameras"][1])
-    return about
 
 
 @pytest.mark.parametrize(
