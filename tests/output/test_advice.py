@@ -75,43 +75,42 @@ def test_a_frames_facts_are_read_off_its_image() -> None:
     depth = np.zeros((240, 320), np.float32)
     depth[:, 80:] = np.linspace(0.5, 2.5, 240, dtype=np.float32)
     depth[0, 0] = np.nan
-    lost = no_estimate(0, 0.0, "lost", 4, 0.01)
-    seen = lost_frame(lost, depth, None, REACH_M)
+    seen = lost_frame(LOST, depth, None, REACH_M)
     assert seen.read == pytest.approx(0.75, abs=0.02)
     assert (seen.nearest_m, seen.farthest_m) == pytest.approx((0.54, 2.46), abs=0.02)
     assert not any(seen.counts[name] for name in ("out_of_reach", "with_hand", "judged"))
-    assert lost_frame(lost, depth, None, 0.4).counts["out_of_reach"]
+    assert lost_frame(LOST, depth, None, 0.4).counts["out_of_reach"]
     watch = Watch(REACH_M)
-    watch.see((lost,), np.zeros_like(depth), (None,))
-    watch.see((replace(lost, lost=False),), depth, (None,))
+    watch.see((LOST,), np.zeros_like(depth), (None,))
+    watch.see((replace(LOST, lost=False),), depth, (None,))
     assert watch.facts[0].counts["lost"] == 1 and watch.advice("right") == ()
-    watch.see((lost,), np.zeros_like(depth), (None,))
+    watch.see((LOST,), np.zeros_like(depth), (None,))
     assert "0 % of the pixels had readings." in watch.advice("right")[0]
 
 
 def test_advice_to_who_watches_is_of_what_is_recent() -> None:
-    lost, nothing = no_estimate(0, 0.0, "lost", 4, 0.01), np.zeros((6, 8), np.float32)
+    nothing = np.zeros((6, 8), np.float32)
     watch = Watch(REACH_M)
     for count in range(1, 61):
-        watch.see((lost,), nothing, (None,))
+        watch.see((LOST,), nothing, (None,))
         assert bool(watch.advice(None, recent=True)) == (count >= 20), "not of the first frames"
     for _ in range(60):
         assert watch.advice(None, recent=True)[0].startswith("60 of 60 frames were lost")
-        watch.see((replace(lost, lost=False),), nothing, (None,))
+        watch.see((replace(LOST, lost=False),), nothing, (None,))
     assert watch.advice(None, recent=True) == ()
     assert watch.facts[0].counts["lost"] == 60, "the run's are all"
 
 
 def test_a_slot_counts_only_where_it_had_a_hand() -> None:
-    vacant, depth = no_estimate(0, 0.0, "lost", 4, 0.01), np.full((30, 40), 0.5, np.float32)
-    tracked = replace(vacant, lost=False, state=np.zeros(27, np.float32))
+    depth = np.full((30, 40), 0.5, np.float32)
+    tracked = replace(LOST, lost=False, state=np.zeros(27, np.float32))
     watch = Watch(1.2, slots=2)
     nothing = (None, None)
     for _ in range(4):
-        watch.see((tracked, vacant), depth, nothing)
+        watch.see((tracked, LOST), depth, nothing)
     assert watch.advice(None) == () and watch.facts[1].counts["frames"] == 0
     for _ in range(6):
-        watch.see((vacant, vacant), depth, nothing)
+        watch.see((LOST, LOST), depth, nothing)
         watch.see((tracked, replace(tracked, lost=True)), depth, nothing)
     assert [watch.facts[0].counts[name] for name in ("lost", "frames")] == [6, 16]
     reported = watch.advice(None)
