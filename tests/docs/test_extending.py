@@ -12,9 +12,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import suppress
-from functools import partial
+from collections.abc import Iterator
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import numpy as np
@@ -127,12 +126,6 @@ def test_a_reader_of_ones_own_plays_a_range_and_takes_a_name(mine: Path) -> None
         assert track["index"].tolist() == list(range(1, FRAMES))
 
 
-def test_in_python_a_folder_adds_its_choices(mine: Path) -> None:
-    overrides = (f"{group}=mine" for group in GROUPS if group not in ("stream", "view"))
-    tracker = toftrack.make_tracker(*overrides, config_dir=mine / "my_conf")
-    assert tracker.model.space.kind == "Independent" and "horns" in tracker.model.gestures.names
-
-
 def test_an_installed_package_brings_every_kind(package: Path) -> None:
     head = ["tolerance_m=0.02", "neighbourhood_m=0.02", "false_weight=1"]
     given = [f"likelihood.{word}" for word in head] + ["pose_space.iterations=400"]
@@ -222,9 +215,8 @@ def test_a_model_file_names_its_kind_and_imports_nothing(
     ],
 )
 def test_a_kind_that_cannot_be_used_is_one_sentence(kind: str, words: str) -> None:
-    with pytest.raises(ToftrackError) as caught:
+    with pytest.raises(ToftrackError, match=re.escape(words)):
         fit_pose_space(kind, 3)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
 
 
 def test_the_autoencoder_is_trained_in_a_sweep_and_tracks_from_its_file(
@@ -309,21 +301,14 @@ def test_a_score_that_is_none_is_one_sentence(score: str, said: str, mine: Path)
     text = FILES[module.name]
     assert "counts.correct / union.clamp(min=1)" in text
     module.write_text(text.replace("counts.correct / union.clamp(min=1)", score))
-    with pytest.raises(ToftrackError, match=f"^likelihood: Overlap.score {said}") as caught:
+    with pytest.raises(ToftrackError, match=f"^likelihood: Overlap.score {said}"):
         tracker = toftrack.make_tracker("likelihood=mine", *PAPER, config_dir=mine / "my_conf")
         tracker.step(sample().depth_m[0], sample().k)
-    assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(
-    ("name", "more"), [("point_to_surface", ()), ("depths", ("filter.exponent=20",))]
-)
-def test_the_likelihoods_of_the_docs_prefer_the_true_pose(
-    name: str, more: tuple[str, ...], mine: Path
-) -> None:
-    folder = EXAMPLES if name == "point_to_surface" else mine / "my_conf"
-    given = (f"likelihood={name}", "lost.score=0.2")
-    tracker = toftrack.make_tracker(*given, *more, *PAPER, config_dir=folder)
+def test_a_likelihood_of_the_page_prefers_the_true_pose(mine: Path) -> None:
+    given = ("likelihood=depths", "lost.score=0.2", "filter.exponent=20", *PAPER)
+    tracker = toftrack.make_tracker(*given, config_dir=mine / "my_conf")
     scene = sample()
     for index in range(3):
         estimate = tracker.step(scene.depth_m[index], scene.k, index, index / 25)
@@ -379,43 +364,12 @@ def test_toftrack_track_takes_a_folder_of_ones_own(mine: Path) -> None:
         assert len(list(toftrack.track(device, "pose_space=mine", config_dir=folder))) == 1
 
 
-@pytest.fixture
-def camera(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., int]]:
-    """Starts a sender of given bytes, or the example's own of a recording; its port."""
-    monkeypatch.syspath_prepend(EXAMPLES)
-    serve, threads = importlib.import_module("socket_camera").serve, []
-
-    def start(*sent: bytes, recording: Path | None = None) -> int:
-        port = programs.free_port()
-
-        def send() -> None:
-            with socket.create_server(("127.0.0.1", port)) as server:
-                listening.set()
-                connection, _ = server.accept()
-                with connection:
-                    for part in sent:
-                        connection.sendall(part)
-                    ended.wait(10)
-
-        listening = threading.Event()
-        target = send if recording is None else partial(serve, recording, port)
-        threads.append(threading.Thread(target=target, daemon=True))
-        threads[-1].start()
-        if recording is None:
-            listening.wait(10)
-        return port
-
-    ended = threading.Event()
-    yield start
-    ended.set()
-    for thread in threads:
-        thread.join(10)
-
-
-def test_the_camera_behind_a_socket_is_tracked(mine: Path, camera: Callable[..., int]) -> None:
+def test_the_camera_behind_a_socket_is_tracked(mine: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     images = np.stack([frame.depth for frame in Sample(stop=FRAMES)])
     np.savez(mine / "hand.npz", depth_m=images, K=Sample().camera.K, fps=10.0)
-    port = camera(recording=mine / "hand.npz")
+    monkeypatch.syspath_prepend(EXAMPLES)
+    serve, port = importlib.import_module("socket_camera").serve, programs.free_port()
+    threading.Thread(target=serve, args=(mine / "hand.npz", port), daemon=True).start()
     overrides, seen = ("device=socket", f"device.port={port}"), []
     for _ in range(100):  # until it listens
         with suppress(ToftrackError):
@@ -437,21 +391,26 @@ ABOUT = b'{"width": 4, "height": 3, "K": [[9,0,2],[0,9,1],[0,0,1]], "unit_m": 0.
     ("sent", "words"),
     [
         (None, "no camera at 127.0.0.1 port 1 "),
-        ([b"\x00\xff garbage\n"], "begins with no line that describes it"),
-        ([ABOUT.replace(b"4", b"-4")], "begins with no line that describes it"),
-        ([b"1" * 20_000], "begins with no line that describes it"),
-        ([ABOUT, b"\0" * 5], "sent nothing for 0.2 s"),
+        (b"\x00\xff garbage\n", "begins with no line that describes it"),
+        (ABOUT.replace(b"4", b"-4"), "begins with no line that describes it"),
+        (b"1" * 20_000, "begins with no line that describes it"),
+        (ABOUT + b"\0" * 5, "sent nothing for 0.2 s"),
     ],
 )
-def test_what_a_socket_sends_wrongly_is_one_sentence(
-    sent: list[bytes] | None, words: str, camera: Callable[..., int]
-) -> None:
-    port = 1 if sent is None else camera(*sent)
-    overrides = ("device=socket", f"device.port={port}", "device.timeout_s=0.2")
-    with pytest.raises(ToftrackError) as caught:
-        with toftrack.make_device(*overrides, config_dir=EXAMPLES) as device:
-            next(iter(device))
-    assert words in str(caught.value) and "\n" not in str(caught.value)
+def test_what_a_socket_sends_wrongly_is_one_sentence(sent: bytes | None, words: str) -> None:
+    with ExitStack() as opened:
+        server = opened.enter_context(socket.create_server(("127.0.0.1", 0)))
+        if sent is not None:
+
+            def send() -> None:
+                opened.enter_context(server.accept()[0]).sendall(sent)
+
+            threading.Thread(target=send).start()
+        port = 1 if sent is None else server.getsockname()[1]
+        overrides = ("device=socket", f"device.port={port}", "device.timeout_s=0.2")
+        with pytest.raises(ToftrackError, match=words):
+            device = toftrack.make_device(*overrides, config_dir=EXAMPLES)
+            next(iter(opened.enter_context(device)))
 
 
 @pytest.mark.slow
