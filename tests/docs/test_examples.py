@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import bags
 from helpers.hands import hand_estimate, lost_hand
 from helpers.programs import free_port
 from helpers.tracking import ROOT, sample
@@ -200,23 +201,9 @@ def ros(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 def image(depth_m: np.ndarray, encoding: str, number: int = 0, big: bool = False) -> Message:
     """A sensor_msgs/Image whose rows are padded by 3 bytes."""
-    kind = {"16UC1": "u2", "32FC1": "f4", "rgb8": "u1"}[encoding]
-    words = np.rint(1000 * depth_m) if kind == "u2" else depth_m
-    height, width = depth_m.shape
-    rows = words.astype((">" if big else "<") + kind).view(np.uint8).reshape(height, -1)
-    data = np.pad(rows, ((0, 0), (0, 3))).tobytes()
     stamp = Message(sec=1_900_000_000, nanosec=40_000_000 * number)
     header = Message(stamp=stamp, frame_id="depth_optical")
-    step = len(data) // height
-    return Message(
-        header=header,
-        height=height,
-        width=width,
-        encoding=encoding,
-        is_bigendian=big,
-        step=step,
-        data=data,
-    )
+    return Message(header=header, **bags.image(depth_m, encoding, big, pad=3))
 
 
 def test_ros_images_become_depth(ros: dict[str, Any]) -> None:
