@@ -6,6 +6,7 @@ from __future__ import annotations
 import inspect
 import json
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -104,6 +105,15 @@ def test_the_picture_of_the_rooms_is_of_this_code() -> None:
     assert set(imports("tracking")) >= {"detector", "render", "refinement"}
     for place, room in enumerate(order):
         assert all(order.index(name) > place for name in imports(room) if name in order), room
+
+
+@pytest.mark.parametrize(
+    "name", ["make_gallery", "make_moving_picture", "make_rooms", "make_types", "run_notebook"]
+)
+def test_the_programs_of_the_pages_tell_what_they_do(name: str) -> None:
+    command = [sys.executable, str(ROOT / "docs" / f"{name}.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith(f"usage: {name}.py"), done.stderr
 
 
 def test_the_figures_are_in_the_readme_and_say_where_they_were_made() -> None:
