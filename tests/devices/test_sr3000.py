@@ -233,14 +233,6 @@ def test_iterating_again_goes_on() -> None:
     assert sorted(set(second)) == second
 
 
-def test_an_exception_in_the_consumer_releases_the_camera() -> None:
-    device = camera(loop=True)
-    with pytest.raises(RuntimeError, match="the consumer's own"), device:
-        for _ in device:
-            raise RuntimeError("the consumer's own")
-    assert_released(device)
-
-
 def test_ctrl_c_during_a_transfer_releases_the_camera() -> None:
     device = camera(loop=True, fps=2.0, usb={"timeout_ms": 1000})
     received = programs.interrupted_when(lambda: device.counts.received)
