@@ -26,6 +26,7 @@ BACK_ENDS = ("torch", "numba")
 CPU = torch.device("cpu")
 SIZES = ((48, 64), (144, 176), (240, 320))
 FOCAL = {48: 60.0, 144: 170.0, 240: 280.0, 480: 560.0}
+SHAPE = default_hand_shape()
 SHAPES = {
     "default": {},
     "small and thin": {"hand_length_m": 0.14, "thickness": 0.7},
@@ -116,10 +117,9 @@ def test_agrees_with_reference(a: int, b: int) -> None:
 
 def test_threads_share_the_particles():
     """The same counts from one thread, from several, and from calls at the same time."""
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 48, 64, 5.0, 0.4, 6)
+    evidence = random_evidence(SHAPE, 48, 64, 5.0, 0.4, 6)
     states = random_states(300, (0.3, 0.5), 6)
-    scorer = make_scorer("numba", shape, CPU)
+    scorer = make_scorer("numba", SHAPE, CPU)
     alone = scorer(states, evidence)
     torch.set_num_threads(4)
     with ThreadPoolExecutor(3) as pool:
@@ -142,8 +142,7 @@ def test_several_hands_at_once_count_as_each_alone(back_end):
 
 
 def test_hands_outside_and_behind_and_at_the_camera(back_end):
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 144, 176, 20.0, 0.4, 1)
+    evidence = random_evidence(SHAPE, 144, 176, 20.0, 0.4, 1)
     states = torch.zeros(10, 27)
     states[:, 2] = 0.4
     for i, offset in enumerate(([1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, -1])):
@@ -153,22 +152,21 @@ def test_hands_outside_and_behind_and_at_the_camera(back_end):
     states[7, :3] = torch.tensor([-0.19, 0.1, 0.4])
     states[8, :3] = torch.tensor([0.0, 0.25, 0.4])
     states[9, :3] = torch.tensor([0.0, 0.06, 0.1])  # larger than the image
-    found = make_scorer(back_end, shape, CPU)(states, evidence)
-    check(found, ReferenceScorer(shape)(states, evidence))
+    found = make_scorer(back_end, SHAPE, CPU)(states, evidence)
+    check(found, ReferenceScorer(SHAPE)(states, evidence))
     assert all((field[:5] == 0).all() for field in found)
     assert (found.false[6:] > 0).all()
 
 
 def test_states_that_are_not_finite_count_nothing(back_end):
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 48, 64, 5.0, 0.4, 2)
+    evidence = random_evidence(SHAPE, 48, 64, 5.0, 0.4, 2)
     states = torch.zeros(20, 27)
     states[:, 1:3] = torch.tensor([0.08, 0.4])
-    good = ReferenceScorer(shape)(states, evidence)
+    good = ReferenceScorer(SHAPE)(states, evidence)
     for i, j in enumerate((0, 2, 4, 6, 26)):
         states[2 * i, j] = (math.nan, math.inf, -math.inf)[i % 3]
     states[11, 2], states[12, 0], states[13, 3], states[14, 8] = 1e30, 1e30, 1e8, -1e7
-    found = make_scorer(back_end, shape, CPU)(states, evidence)
+    found = make_scorer(back_end, SHAPE, CPU)(states, evidence)
     for field, expected in zip(found, good, strict=True):
         assert field.isfinite().all()
         assert (field[0:10:2] == 0).all()
@@ -177,9 +175,8 @@ def test_states_that_are_not_finite_count_nothing(back_end):
 
 
 def test_no_particles_and_one(back_end):
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 48, 64, 5.0, 0.4, 3)
-    scorer = make_scorer(back_end, shape, CPU)
+    evidence = random_evidence(SHAPE, 48, 64, 5.0, 0.4, 3)
+    scorer = make_scorer(back_end, SHAPE, CPU)
     assert all(field.shape == (0,) for field in scorer(torch.zeros(0, 27), evidence))
     states = random_states(40, (0.3, 0.5), 3)
     whole = scorer(states, evidence)
@@ -191,24 +188,22 @@ def test_no_particles_and_one(back_end):
 
 
 def test_a_crop_counts_as_the_whole(back_end):
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, 240, 320, 12.0, 0.5, 4)
+    evidence = random_evidence(SHAPE, 240, 320, 12.0, 0.5, 4)
     states = torch.zeros(20, 27)
     states[:, 1:3] = torch.tensor([0.08, 0.5])
     states += 0.02 * torch.randn(20, 27, generator=torch.Generator().manual_seed(4))
-    scorer = make_scorer(back_end, shape, CPU)
+    scorer = make_scorer(back_end, SHAPE, CPU)
     check(scorer(states, evidence.cropped(31, 7, 301, 236)), scorer(states, evidence))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 130), (70, 1), (9, 65)])
 def test_images_of_a_pixel_s_width(back_end, size):
-    shape = default_hand_shape()
-    evidence = random_evidence(shape, *size, 3.0, 0.4, 8)
+    evidence = random_evidence(SHAPE, *size, 3.0, 0.4, 8)
     states = random_states(12, (0.15, 0.5), 8)
     states[:6, :3], states[:6, 3:] = torch.tensor([0.0, 0.05, 0.3]), 0.1
     states[1, 2], states[2, 4] = -0.3, math.nan
-    expected = ReferenceScorer(shape)(states.nan_to_num(), evidence)
-    found = make_scorer(back_end, shape, CPU)(states, evidence)
+    expected = ReferenceScorer(SHAPE)(states.nan_to_num(), evidence)
+    found = make_scorer(back_end, SHAPE, CPU)(states, evidence)
     keep = [i for i in range(12) if i != 2]
     check(Counts(*(f[keep] for f in found)), Counts(*(f[keep] for f in expected)))
     assert all(field[2] == 0 for field in found)
