@@ -27,9 +27,7 @@ def test_every_reader_refuses_a_pipe_in_place_of_its_file(tmp_path: Path) -> Non
                 recover_recording(reader.given)
             reader.read(reader.given)
         except ToftrackError as error:
-            said = str(error)
-            assert "\n" not in said, reader.name
-            assert "pipe" in said or reader.name.startswith("part "), said
+            assert "pipe" in str(error) or reader.name.startswith("part "), reader.name
         else:
             assert reader.name == "overrides.yaml"  # a job that is told to have failed
 

@@ -44,20 +44,16 @@ NAMES = tuple(f"joint_{i}" for i in range(21))
 
 def estimate(index: int, **changes: Any) -> Estimate:
     rng = np.random.default_rng(index)
-    sizes = {"joints_m": (21, 3), "state": 27, "latent": 4, "covariance": (10, 10)}
-    whole = no_estimate(index, index / 25, "tracking", 4, 0.01 * (1 + index)).updated(
-        **{name: rng.normal(size=size).astype(np.float32) for name, size in sizes.items()},
-        joint_sigma_m=np.full((21, 3), 0.01, np.float32),
-        joint_ok=np.ones(21, bool),
-        lost=index % 4 == 3,
-        score=0.5 + index / 100,
-        confidence=0.9 - index / 100,
-        outside_rad=0.1,
-        side="left",
-        side_probability=1.0,
-        gesture="palm",
-    )
-    return replace(whole, **changes)
+    usual = {
+        "latent": rng.normal(size=4).astype(np.float32),
+        "covariance": rng.normal(size=(10, 10)).astype(np.float32),
+        "joint_sigma_m": np.full((21, 3), 0.01, np.float32),
+        "side": "left",
+        "lost": index % 4 == 3,
+        "score": 0.5 + index / 100,
+        "compute_s": 0.01 * (1 + index),
+    }
+    return hand_estimate(index, **usual | changes)
 
 
 def write(
@@ -332,9 +328,8 @@ def test_a_run_json_that_is_damaged_is_reported(tmp_path: Path, changes: dict[st
     write(tmp_path, [estimate(i) for i in range(3)])
     path = tmp_path / "run.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | changes))
-    with pytest.raises(ToftrackError) as error:
+    with pytest.raises(ToftrackError):
         recover(tmp_path)
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("rest", [b'{"index":9,"jo', b"\0\0\0\0", b""])
