@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +42,7 @@ from toftrack.programs.recover import recover
 from toftrack.programs.report import read_runs
 from toftrack.recordings.image_folder import write_image_folder
 from toftrack.recordings.npz import Recording, write_recording
-from toftrack.recordings.sr_frame import encode_frame, nominal_camera
+from toftrack.recordings.sr_frame import encode_frame
 from toftrack.recordings.srs import SrsWriter
 from toftrack.recordings.unfinished import Facts, UnfinishedRecording, compressed, recover_recording
 from toftrack.views.labelling.page import LabelPage
@@ -143,37 +142,27 @@ def _recordings(folder: Path) -> list[Reader]:
     times = np.arange(FRAMES) / 25
     amplitude = np.full(depth.shape, 700, np.uint16)
     npz = _new(folder, "npz") / "recording.npz"
-    facts: dict[str, Any] = {"what": "a test"}
-    recording = Recording(
-        depth=depth,
-        radial=False,
-        camera=camera,
-        timestamp_s=times,
-        fps=25.0,
-        amplitude=amplitude,
-        metadata=facts,
-    )
+    facts = {"radial": False, "camera": camera, "fps": 25.0, "metadata": {"what": "a test"}}
+    recording = Recording(depth=depth, amplitude=amplitude, timestamp_s=times, **facts)
     write_recording(npz, recording)
     unfinished = _new(folder, "unfinished") / "recording.npz.part"
     growing = UnfinishedRecording(unfinished)
-    growing.begin(Facts(camera, False, True, 25.0, facts))
-    for number, image in enumerate(depth):
-        raw = image.tobytes(), amplitude[number].tobytes()
-        growing.append(
-            number, times[number], (raw[0], compressed(raw[0]), raw[1], compressed(raw[1]))
-        )
+    growing.begin(Facts(camera, False, True, 25.0, {"what": "a test"}))
+    for number, images in enumerate(zip(depth, amplitude, strict=True)):
+        seen, strength = (image.tobytes() for image in images)
+        packed = seen, compressed(seen), strength, compressed(strength)
+        growing.append(number, times[number], packed)
     growing.close()
     srs = _new(folder, "srs") / "recording.srs"
-    range_m = 7.5
-    shape = (nominal_camera().height, nominal_camera().width)
+    frame = encode_frame(np.full((144, 176), 0.8, np.float32), None, 7.5)
     with closing(SrsWriter(srs)) as writer:
         for time in times[:2]:
-            writer.append(encode_frame(np.full(shape, 0.8, np.float32), None, range_m), float(time))
+            writer.append(frame, float(time))
     png = folder / "png"
     write_image_folder(png, recording)
     stack = _new(folder, "npy") / "stack.npy"
-    np.save(stack, np.rint(1000 * depth).astype(np.uint16))
     words = np.rint(1000 * depth).astype(np.uint16)
+    np.save(stack, words)
     grey = videos.write_grey(_new(folder, "grey") / "grey.mkv", words)
     pages = _new(folder, "tif") / "stack.tif"
     cv2.imwritemulti(str(pages), list(words))
