@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hands import hand_estimate
-from helpers.tracking import ROOT
+from helpers.tracking import ROOT, code_of
 
 import toftrack
 from toftrack.hand.shape import default_hand_shape
@@ -51,8 +50,7 @@ def test_the_table_of_degrees_says_which_are_ok(tmp_path: Path) -> None:
         for index in range(30):
             writer.append((hand_estimate(index, bent=0.5, joint_ok=dice.random(21) < 0.8),))
     results = toftrack.Results(toftrack.read_results(tmp_path / "track.npz"))
-    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"<!-- test: degrees -->\n```python\n(.*?)```", text, re.DOTALL)
+    code = code_of("formats.md", "degrees")
     known = {"np": np, "toftrack": toftrack, "results": results}
     exec(code.replace('toftrack.track("hand.npz").results()', "results"), known)
     table, ok = known["table"], every_neighbour(results.joint_ok)
@@ -67,10 +65,8 @@ def test_the_table_of_degrees_says_which_are_ok(tmp_path: Path) -> None:
 def test_the_joints_follow_from_state_and_hand_shape_as_the_page_says(
     side: str, tmp_path: Path
 ) -> None:
-    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"<!-- test: kinematics -->\n```python\n(.*?)```", text, re.DOTALL)
     known: dict[str, Any] = {}
-    exec(code, known)
+    exec(code_of("formats.md", "kinematics"), known)
     shape = default_hand_shape(side=side)
     shape.save(tmp_path / "hand_shape.json")
     state = torch.from_numpy(np.random.default_rng(0).normal(0, 0.5, (1, 27))).float()

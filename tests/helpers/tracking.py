@@ -5,6 +5,7 @@ The recording is rendered from a mesh, by a renderer that is not ours, and carri
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
@@ -27,6 +28,13 @@ from toftrack.tracking.tracker import Tracker
 
 ROOT = Path(__file__).parents[2]
 CONF = ROOT / "conf"
+
+
+def code_of(page: str, name: str) -> str:
+    """The block of code that follows the marker of that name in a page of docs/."""
+    text = (ROOT / "docs" / page).read_text(encoding="utf-8")
+    (block,) = re.findall(rf"<!-- test: {name} -->\n```\w+\n(.*?)```", text, re.DOTALL)
+    return block
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import logging
-import re
 import struct
 import zipfile
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 from helpers.damage import damaged
 from helpers.programs import QUICK
-from helpers.tracking import ROOT
+from helpers.tracking import code_of
 
 from toftrack.api import make_device
 from toftrack.devices.replay import Replay
@@ -45,9 +44,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_camera_file_that_the_page_shows_is_read(folder: Path) -> None:
-    page = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
-    (example,) = re.findall(r"<!-- test: camera.json -->\n```json\n(.*?)```", page, re.DOTALL)
-    (folder / "camera.json").write_text(example)
+    (folder / "camera.json").write_text(code_of("formats.md", "camera.json"))
     read = ImageFolder(folder)
     np.testing.assert_array_equal(read.camera.K, [[200, 0, 88], [0, 200, 72], [0, 0, 1]])
     assert (read.camera.width, read.camera.height) == (176, 144)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import http.server
 import json
-import re
 import shutil
 import subprocess
 import threading
@@ -22,7 +21,7 @@ from helpers.browsing import eventually
 from helpers.chromium import DRAWS_IN_3D, headless_chromium
 from helpers.hands import hand_estimate
 from helpers.settings import part
-from helpers.tracking import ROOT
+from helpers.tracking import ROOT, code_of
 
 from toftrack.devices.replay import Sample
 from toftrack.frames.estimate import Estimate
@@ -203,8 +202,7 @@ for (let k = 0; k < 10; k++) {
 def test_the_docs_cursor_follows_the_fingertip_and_a_pinch_clicks_where_it_was(
     stream: Any, page: Any
 ) -> None:
-    text = (ROOT / "docs" / "streams.md").read_text(encoding="utf-8")
-    (code,) = re.findall(r"<!-- test: cursor -->\n```js\n(.*?)```", text, re.DOTALL)
+    code = code_of("streams.md", "cursor")
     page.get(f"{stream.url}feed.js")  # no page, but of this origin
     eventually(lambda: not stream._server.clients)
     assert "ws://127.0.0.1:8766/" in code and "u: [0.37, 0.76]" in code
