@@ -1,7 +1,5 @@
 """What holds after every test of a device."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 

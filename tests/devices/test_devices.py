@@ -1,7 +1,5 @@
 """Devices: the frames of a recording, in order, as they were recorded."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Orbbec's SDK itself plays a recording; skipped where the SDK cannot be loaded."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Orbbec cameras through a stand-in for the SDK: what a camera does, and what goes wrong."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from types import ModuleType

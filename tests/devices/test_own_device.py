@@ -1,7 +1,5 @@
 """A camera of one's own: the code and configuration of docs/cameras.md, as they stand there."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """RealSense cameras through the SDK's software device; skipped where the SDK cannot be loaded."""
 
-from __future__ import annotations
-
 import sys
 import time
 from pathlib import Path

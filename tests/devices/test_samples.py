@@ -1,7 +1,5 @@
 """The recordings that come with the package."""
 
-from __future__ import annotations
-
 from importlib import resources
 
 import numpy as np

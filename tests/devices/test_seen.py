@@ -1,7 +1,5 @@
 """Which cameras a user is told of who has not plugged in the one that is meant."""
 
-from __future__ import annotations
-
 import re
 import sys
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """The SR3000: the real driver against a virtual camera that misbehaves in every way known."""
 
-from __future__ import annotations
-
 import gc
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The vendor's library: against a stand-in that is compiled here."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

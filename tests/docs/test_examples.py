@@ -2,8 +2,6 @@
 Unity and ROS 2.
 """
 
-from __future__ import annotations
-
 import asyncio
 import re
 import runpy

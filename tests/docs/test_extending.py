@@ -1,8 +1,6 @@
 """Parts of one's own, as docs/extending.md and docs/examples/plugins have them: from the folder of
 --config-dir and from an installed package, and what is said where one is not there."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

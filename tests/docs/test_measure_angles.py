@@ -1,7 +1,5 @@
 """docs/measure_angles.py, and what docs/formats.md says of the joint angles."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

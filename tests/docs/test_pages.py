@@ -1,8 +1,6 @@
 """README.md, CONTRIBUTING.md and docs/: links lead to a file, and to a heading or mark in it; the
 picture of the rooms is that of the code; docs/figures.json is the one source of figures."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import re

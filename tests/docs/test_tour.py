@@ -1,7 +1,5 @@
 """The notebook runs as it stands, and keeps its outputs."""
 
-from __future__ import annotations
-
 import base64
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Archives are written as numpy reads them; those of others are read with bounds."""
 
-from __future__ import annotations
-
 import io
 import struct
 import tracemalloc

@@ -1,7 +1,5 @@
 """JSON of others: whatever Python makes of it, what cannot be meant is a ValueError."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """Pipes, devices and folders with them are refused at once, whoever would read them."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whatever a folder of somebody else holds, nothing outside of it changes, and nothing waits."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable

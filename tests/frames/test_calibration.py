@@ -1,7 +1,5 @@
 """The calibration finds a known camera again, from chequerboards that are rendered for it."""
 
-from __future__ import annotations
-
 import json
 from contextlib import closing
 from dataclasses import replace

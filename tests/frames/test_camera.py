@@ -1,7 +1,5 @@
 """The camera: projection, radial distance, distortion and depth correction agree."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Readers of animations, by the rules of their formats."""
 
-from __future__ import annotations
-
 import json
 import struct
 

@@ -1,7 +1,5 @@
 """ROS bags for the tests, written by rosbags itself: skip where it is not installed."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

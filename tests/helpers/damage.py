@@ -1,7 +1,5 @@
 """Files that arrive other than they were sent."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -1,7 +1,5 @@
 """Tiny folders in the formats of public data sets, made from the sample recording."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

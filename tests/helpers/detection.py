@@ -1,7 +1,5 @@
 """What the tests of the detector share: small networks, fixed ones, scenes with one hand."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache

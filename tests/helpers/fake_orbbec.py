@@ -1,7 +1,5 @@
 """A module like pyorbbecsdk as far as a camera needs it: no SDK, no camera."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Sequence
 from types import SimpleNamespace

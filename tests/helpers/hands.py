@@ -1,7 +1,5 @@
 """Estimates of hands that nobody tracked, whole as the tracker's, for what shows or sends them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from typing import Any

@@ -1,7 +1,5 @@
 """Tracked frames of one hand, as views get them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

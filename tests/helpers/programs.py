@@ -1,7 +1,5 @@
 """`python track.py` within the tests' process, which has loaded everything already."""
 
-from __future__ import annotations
-
 import io
 import logging
 import os

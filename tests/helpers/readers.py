@@ -1,7 +1,5 @@
 """Every reader of files, and a valid file of each kind made by the project's own writers."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import zipfile

@@ -1,7 +1,5 @@
 """Hands that are drawn as the tracker's own model has them, and what it makes of their images."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

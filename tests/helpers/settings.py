@@ -1,7 +1,5 @@
 """Parts as conf/ fills them, with changes: nothing in Python repeats those numbers."""
 
-from __future__ import annotations
-
 from functools import cache, partial
 from inspect import signature
 from typing import Any

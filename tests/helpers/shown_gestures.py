@@ -1,7 +1,5 @@
 """Poses and what they are called, as the tests of gestures share them."""
 
-from __future__ import annotations
-
 import numpy as np
 from helpers.settings import gestures
 

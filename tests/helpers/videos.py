@@ -1,7 +1,5 @@
 """Videos of depth for the tests: an Azure Kinect's recording, and lossless grey ones."""
 
-from __future__ import annotations
-
 import json
 import struct
 from fractions import Fraction

@@ -1,7 +1,5 @@
 """What is said when most of a run was lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any

@@ -1,7 +1,5 @@
 """A run as glTF: read back with the format's own rules, and compared with the run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A hand of a length that hands do not have speaks against the focal length."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`stream=osc`: the documented addresses, read from the datagrams."""
 
-from __future__ import annotations
-
 import socket
 from dataclasses import replace
 from typing import Any

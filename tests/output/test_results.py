@@ -2,8 +2,6 @@
 several hands.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """docs/track_line.schema.json describes the lines as they are, and the types follow from it."""
 
-from __future__ import annotations
-
 import copy
 import importlib.util
 import json

@@ -1,7 +1,5 @@
 """The One Euro filter on estimates: calm at rest, quick in motion, anew after the hand was lost."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

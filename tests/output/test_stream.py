@@ -1,7 +1,5 @@
 """Estimates for other programs: as lines on standard output, as datagrams, never in the way."""
 
-from __future__ import annotations
-
 import errno
 import json
 import logging

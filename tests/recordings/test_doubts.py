@@ -1,7 +1,5 @@
 """What looks wrong in a recording is said with the value that would fit; what is right is not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,7 +1,5 @@
 """A folder or `.zip` of images: its camera, what in it is depth, images of others, hostile ones."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import logging

@@ -1,7 +1,5 @@
 """Frames of any device become a recording, which grows as they come and is never lost."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import threading

@@ -1,7 +1,5 @@
 """Recordings: what is written is read back, and every broken file is told in one sentence."""
 
-from __future__ import annotations
-
 import pickle
 import re
 import zipfile

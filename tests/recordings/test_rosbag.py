@@ -1,7 +1,5 @@
 """ROS bags: every kind of bag, image and lens gives the frames that went in; bad ones are told."""
 
-from __future__ import annotations
-
 import contextlib
 import struct
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The vendor's stream file: what is written is read back bit by bit, and broken files are told."""
 
-from __future__ import annotations
-
 import struct
 from contextlib import closing
 from pathlib import Path

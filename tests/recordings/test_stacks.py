@@ -1,7 +1,5 @@
 """Stacks in one file: what comes out, what is chosen, what is refused."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import struct

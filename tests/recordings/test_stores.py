@@ -1,7 +1,5 @@
 """What holds for recordings of every kind: whole, damaged, cut off, or not there."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path

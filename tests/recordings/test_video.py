@@ -1,7 +1,5 @@
 """Azure Kinect's recordings and grey videos give what went in; others are told."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The reference of refinement/gauss_newton_numba.py: the same in plain torch, step by step."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import torch

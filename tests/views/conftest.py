@@ -1,7 +1,5 @@
 """A browser, for the pages and videos that are made for one."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import closing
 from typing import Any

@@ -1,7 +1,5 @@
 """`view=browser`: the page, its pictures, its commands, and what must not disturb the tracker."""
 
-from __future__ import annotations
-
 import json
 import threading
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """`view=browser` as a user meets it: recordings that end or repeat, Ctrl-C, and a real browser."""
 
-from __future__ import annotations
-
 import io
 import re
 import sys

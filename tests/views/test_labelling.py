@@ -1,7 +1,5 @@
 """`toftrack label`: what its page is told and may change, and a real browser with real clicks."""
 
-from __future__ import annotations
-
 import io
 import json
 import re

@@ -1,7 +1,5 @@
 """The overlay: what is drawn where, and files that can be opened again."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

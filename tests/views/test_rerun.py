@@ -1,7 +1,5 @@
 """`view=rerun`: what lies in its file, what a viewer is sent, and how it fails."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 import signal

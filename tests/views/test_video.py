@@ -1,7 +1,5 @@
 """The video: whole up to the last second however a run ends, and played by a browser."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

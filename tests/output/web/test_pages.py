@@ -1,7 +1,5 @@
 """`stream=websocket` in headless Chromium: its pages, those of docs/, and the web client there."""
 
-from __future__ import annotations
-
 import functools
 import http.server
 import json

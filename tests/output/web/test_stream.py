@@ -1,7 +1,5 @@
 """`stream=websocket`: who gets the lines, who does not, and what must not hold up the tracker."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import logging
