@@ -53,14 +53,3 @@ def test_the_first_sample_is_small_and_keeps_its_licence() -> None:
     assert len((DATA / "sample.npz").read_bytes()) <= 4_500_000
     licence = (DATA / "README.md").read_text(encoding="utf-8")
     assert "MIT" in licence and "2019 Amazon" in licence
-
-
-def test_samples_truth_lies_on_the_recorded_hand() -> None:
-    # The joints are inside the hand, so the surface in front of a visible one is a little nearer.
-    device = Sample(stop=20)
-    gaps = []
-    for row, frame in enumerate(device):
-        joints = device.truth.joints_m[row][device.truth.joint_visible[row]]
-        u, v = np.round(device.camera.project(joints)).astype(int).T
-        gaps.extend(joints[:, 2] - frame.depth[v, u])
-    assert 0.003 < np.median(gaps) < 0.025
