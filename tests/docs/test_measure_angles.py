@@ -17,7 +17,7 @@ from toftrack.hand.skeleton import forward_kinematics
 from toftrack.output.results import ResultWriter
 
 sys.path.insert(0, str(ROOT / "docs"))
-from measure_angles import bent_deg, every_neighbour, main
+from measure_angles import bent_deg, every_neighbour
 
 
 def joints(**angles_rad: float) -> np.ndarray:
@@ -71,24 +71,6 @@ def test_the_joints_follow_from_state_and_hand_shape_as_the_page_says(
     content = json.loads((tmp_path / "hand_shape.json").read_text())
     found = known["joints_of"](state[0].double().numpy(), side, content)
     assert found == pytest.approx(forward_kinematics(state, shape).joints_m[0].numpy(), abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [(["--help"], "usage: "), (["."], "no .npz there has joints_m"), ([], "FOLDER")],
-)
-def test_without_truth_a_sentence_says_so(
-    words: list[str],
-    said: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "argv", ["measure_angles.py", *words])
-    with pytest.raises(SystemExit) as end:
-        main()
-    assert said in f"{capsys.readouterr()}{end.value}"
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,8 @@ def test_the_picture_of_the_rooms_is_of_this_code() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["make_gallery", "make_moving_picture", "make_rooms", "make_types", "run_notebook"]
+    "name",
+    "make_gallery make_moving_picture make_rooms make_types measure_angles run_notebook".split(),
 )
 def test_the_programs_of_the_pages_tell_what_they_do(name: str) -> None:
     command = [sys.executable, str(ROOT / "docs" / f"{name}.py"), "--help"]
