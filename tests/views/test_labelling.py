@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -42,22 +43,17 @@ def page(tmp_path) -> Iterator[LabelPage]:
     assert ours() == []
 
 
-class Visitor:
-    """The page, without a browser."""
-
-    def __init__(self, socket: Any, token: str) -> None:
-        self.socket, self._token = socket, token
-
-    def ask(self, **content: Any) -> Any:
-        self.socket.send(json.dumps({"token": self._token} | content))
-        return json.loads(self.socket.recv(PATIENCE_S))
-
-
 @pytest.fixture
-def visitor(page) -> Iterator[Visitor]:
+def visitor(page) -> Iterator[SimpleNamespace]:
+    """The page, without a browser."""
     address = page.address.removeprefix("http").partition("#")[0]
     with connect(f"ws{address}labels") as socket:
-        yield Visitor(socket, page.token)
+
+        def ask(**content: Any) -> Any:
+            socket.send(json.dumps({"token": page.token} | content))
+            return json.loads(socket.recv(PATIENCE_S))
+
+        yield SimpleNamespace(socket=socket, ask=ask)
 
 
 def test_the_page_is_told_what_there_is_and_shown_frames(page, visitor) -> None:
