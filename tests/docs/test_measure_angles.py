@@ -1,9 +1,7 @@
 """docs/measure_angles.py, and what docs/formats.md says of the joint angles."""
 
-import json
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -57,20 +55,6 @@ def test_the_table_of_degrees_says_which_are_ok(tmp_path: Path) -> None:
         assert table[f"{name}_ok"].tolist() == ok[:, finger, joint].tolist(), name
     pip = results.state[:, 6 + toftrack.ANGLE_NAMES.index("ring_pip_flexion")]
     assert table.ring_pip_flexion_deg.to_numpy() == pytest.approx(np.degrees(pip))
-
-
-@pytest.mark.parametrize("side", ["right", "left"])
-def test_the_joints_follow_from_state_and_hand_shape_as_the_page_says(
-    side: str, tmp_path: Path
-) -> None:
-    known: dict[str, Any] = {}
-    exec(code_of("formats.md", "kinematics"), known)
-    shape = default_hand_shape(side=side)
-    shape.save(tmp_path / "hand_shape.json")
-    state = torch.from_numpy(np.random.default_rng(0).normal(0, 0.5, (1, 27))).float()
-    content = json.loads((tmp_path / "hand_shape.json").read_text())
-    found = known["joints_of"](state[0].double().numpy(), side, content)
-    assert found == pytest.approx(forward_kinematics(state, shape).joints_m[0].numpy(), abs=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -6,12 +6,14 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
+from helpers.tracking import code_of
 
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import Fitted, HandShape, default_hand_shape
-from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, forward_kinematics
+from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.hand.surface import hand_surface
 
 
@@ -24,47 +26,19 @@ def random_states(n: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> 
     return torch.cat((pose, angles), 1).to(dtype)
 
 
-def exponential(x: float, y: float = 0.0, z: float = 0.0) -> torch.Tensor:
-    """4 x 4 matrix exponential of a rotation's twist."""
-    twist = [[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]]
-    return torch.matrix_exp(torch.tensor(twist, dtype=torch.float64))
-
-
-def shift(x: float, y: float, z: float) -> torch.Tensor:
-    move = torch.eye(4, dtype=torch.float64)
-    move[:3, 3] = torch.tensor([x, y, z], dtype=torch.float64)
-    return move
-
-
-def joints_by_matrix_exponentials(state: torch.Tensor, shape: HandShape) -> torch.Tensor:
-    """A second implementation: joint by joint, 4 x 4 products of twists' exponentials."""
-    world = shift(*state[:3].tolist()) @ exponential(*state[3:6].tolist())
-    if shape.side == "left":
-        world = world @ torch.diag(torch.tensor([-1.0, 1.0, 1.0, 1.0], dtype=torch.float64))
-    angle = dict(zip(ANGLE_NAMES, state[6:].tolist(), strict=True))
-    joints = [world[:3, 3]]
-    for finger, name in enumerate(("thumb", "index", "middle", "ring", "little")):
-        first, second, third = ("cmc", "mcp", "ip") if name == "thumb" else ("mcp", "pip", "dip")
-        base = torch.eye(4, dtype=torch.float64)
-        base[:3, :3] = shape.base_frames[finger]
-        pose = world @ shift(*shape.base_m[finger].tolist()) @ base
-        joints.append(pose[:3, 3])
-        for bone, joint in enumerate((first, second, third)):
-            pose = pose @ exponential(0, 0, angle.get(f"{name}_{joint}_abduction", 0.0))
-            pose = pose @ exponential(angle[f"{name}_{joint}_flexion"])
-            pose = pose @ shift(0, -float(shape.bone_lengths_m[finger, bone]), 0)
-            joints.append(pose[:3, 3])
-    return torch.stack(joints)
-
-
 @pytest.mark.parametrize("side", ["right", "left"])
-def test_kinematics_agree_with_products_of_matrix_exponentials(side: str) -> None:
-    shape = default_hand_shape(side=side).to(torch.float64)
-    states = random_states(20)
-    joints = forward_kinematics(states, shape).joints_m
-    expected = torch.stack([joints_by_matrix_exponentials(state, shape) for state in states])
+def test_kinematics_agree_with_those_that_the_page_shows(side: str, tmp_path: Path) -> None:
+    """A second implementation, which reads the file of the hand."""
+    page: dict[str, Any] = {}
+    exec(code_of("formats.md", "kinematics"), page)
+    shape, states = default_hand_shape(side=side), random_states(20)
+    shape.save(tmp_path / "hand_shape.json")
+    sizes = json.loads((tmp_path / "hand_shape.json").read_text())
+    each = [page["joints_of"](state.numpy(), side, sizes) for state in states]
+    expected = torch.from_numpy(np.stack(each))
+    joints = forward_kinematics(states, shape.to(torch.float64)).joints_m
     torch.testing.assert_close(joints, expected, atol=1e-9, rtol=0)
-    single = forward_kinematics(states.float(), shape.to(torch.float32)).joints_m
+    single = forward_kinematics(states.float(), shape).joints_m
     torch.testing.assert_close(single.double(), expected, atol=3e-6, rtol=0)
 
 
