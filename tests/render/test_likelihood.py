@@ -13,9 +13,9 @@ from helpers.tracking import sample
 
 from toftrack.hand.shape import default_hand_shape
 from toftrack.hand.skeleton import forward_kinematics
-from toftrack.hand.surface import hand_surface
+from toftrack.hand.surface import hand_surface, parted
 from toftrack.render.likelihood import FMeasure
-from toftrack.render.reference import ReferenceScorer
+from toftrack.render.reference import ReferenceScorer, render_range_images
 from toftrack.render.scoring import Counts
 from toftrack.render.segmentation import Observation
 
@@ -42,22 +42,11 @@ def hand_states(n: int, seed: int) -> torch.Tensor:
 
 
 def surfaces(state: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """One hand's depth, (H, W) with 0 where there is none, and the wrist's silhouette.
-
-    The quadratic of every ray and ellipsoid in double precision.
-    """
+    """One hand's depth, (H, W) with 0 where there is none, and the wrist's silhouette."""
     shape = SHAPE.to(torch.float64)
-    both = hand_surface(shape).pose(forward_kinematics(state[None].double(), shape))
-    inverse = np.linalg.inv(both.axes_m[0].numpy())
-    v, u = np.mgrid[:HEIGHT, :WIDTH]
-    rays = np.linalg.inv(K.double().numpy()) @ np.stack((u, v, np.ones_like(u))).reshape(3, -1)
-    p, q = inverse @ rays, inverse @ both.centres_m[0].numpy()[..., None]  # (E, 3, pixels or 1)
-    a, b, c = (p * p).sum(1), (p * q).sum(1), (q * q).sum(1) - 1
-    with np.errstate(invalid="ignore"):
-        z = (b - np.sqrt(b * b - a * c)) / a  # NaN where the ellipsoid is missed
-    z = np.where(z > 0, z, np.inf).reshape(-1, HEIGHT, WIDTH)
-    nearest = z[:-1].min(0)
-    return np.where(nearest < np.inf, nearest, 0), z[-1] < np.inf
+    both = parted(hand_surface(shape).pose(forward_kinematics(state[None].double(), shape)))
+    hand, wrist = (render_range_images(part, K.double(), HEIGHT, WIDTH)[0] for part in both)
+    return hand.numpy(), wrist.numpy() > 0
 
 
 def scene_of(state: torch.Tensor, seed: int) -> Observation:
