@@ -8,12 +8,12 @@ from unittest.mock import patch
 import cv2
 import numpy as np
 import pytest
-from helpers.hands import lost_hand
+from helpers.hands import hand_estimate, lost_hand
 from helpers.videos import video_frames
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
-from toftrack.frames.estimate import Estimate, no_estimate
+from toftrack.frames.estimate import Estimate
 from toftrack.hand.shape import default_hand_shape
 from toftrack.views import overlay
 from toftrack.views.overlay import CAPTION_PX, VideoView
@@ -27,21 +27,8 @@ THUMB, LITTLE = (0, 159, 230), (167, 121, 204)  # BGR
 
 
 def hand(lost: bool = False) -> Estimate:
-    """The five fingers as fans of straight lines at 0.5 m, thumb to the right."""
-    joints = np.zeros((21, 3), np.float32)
-    for finger in range(5):
-        angle = math.radians(30 + 30 * finger)
-        reach = np.array([0.04, 0.06, 0.08, 0.10])[:, None]
-        direction = np.array([math.cos(angle), -math.sin(angle), 0])
-        joints[4 * finger + 1 : 4 * finger + 5] = reach * direction
-    joints[:, 2] = 0.5
-    return dataclasses.replace(
-        no_estimate(7, 0.28, "tracking", 4, 0.01),
-        joints_m=joints,
-        lost=lost,
-        score=0.9,
-        joint_ok=np.full(21, not lost),
-    )
+    """Half a metre away, the thumb to the right."""
+    return hand_estimate(7, lost=lost, joint_ok=np.full(21, not lost))
 
 
 def sides(panel: np.ndarray, scale: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -58,15 +45,10 @@ def is_grey(picture: np.ndarray) -> bool:
     return bool((picture.max(axis=-1) == picture.min(axis=-1)).all())
 
 
-def present(**changes: object) -> Estimate:
-    reported = {"state": np.zeros(27, np.float32), "side": "right", "side_probability": 1.0}
-    return dataclasses.replace(hand(), **reported | changes)
-
-
-def other_hand(**changes: object) -> Estimate:
+def other_hand() -> Estimate:
     """Another one, 10 cm to the left and 10 cm farther away, of a left hand that is nearly sure."""
     joints = hand().joints_m + np.array([-0.1, 0, 0.1], np.float32)
-    return present(**{"joints_m": joints, "side": "left", "side_probability": 0.83} | changes)
+    return dataclasses.replace(hand(), joints_m=joints, side="left", side_probability=0.83)
 
 
 def panel_sides(
@@ -87,8 +69,8 @@ def two(one: Estimate, other: Estimate) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def test_two_hands_are_drawn_in_the_colours_of_their_slots() -> None:
-    alone = panel_sides(present())[1]
-    caption, left, right = two(present(), other_hand())
+    alone = panel_sides(hand())[1]
+    caption, left, right = two(hand(), other_hand())
     assert colour_share(left, THUMB) > 1.3 * colour_share(alone, THUMB)
     for rgb in SLOT_RGB[:2]:
         assert colour_share(alone, rgb[::-1]) < 1e-4 < colour_share(left, rgb[::-1])
