@@ -95,12 +95,9 @@ def _sample_rays() -> np.ndarray:
     v, u, dv, du = np.meshgrid(
         np.arange(TRUE.height), np.arange(TRUE.width), steps, steps, indexing="ij"
     )
-    focal, centre = TRUE.K[[0, 1], [0, 1]], TRUE.K[:2, 2]
-    rays = distorted = (np.stack([u + du, v + dv], -1) - centre) / focal
-    for _ in range(15):  # a fixed point: the distortion is mild, and only of the first order
-        radial = 1 + TRUE.distortion[0] * (rays**2).sum(-1)
-        rays = distorted / radial[..., None]
-    return rays
+    pixels = np.stack([u + du, v + dv], -1)
+    rays = cv2.undistortPoints(pixels.reshape(-1, 1, 2), TRUE.K, TRUE.distortion)
+    return rays.reshape(pixels.shape)
 
 
 @pytest.fixture(scope="module")
