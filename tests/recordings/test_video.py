@@ -4,7 +4,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
 from helpers.videos import (
@@ -20,6 +19,7 @@ from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import Given
 from toftrack.recordings.store import open_recording
+from toftrack.views.video import VideoFile
 
 K = np.array([[252.0, 0, 166.0], [0, 253.0, 140.0], [0, 0, 1]])
 ABOUT = calibration(K, 512, (96, 90))
@@ -153,22 +153,13 @@ def test_without_a_camera_a_video_asks_for_one(tmp_path: Path) -> None:
         Replay(path)
 
 
-def write_colour(path: Path, count: int = 5) -> Path:
-    """A video as telephones make them."""
-    container = av.open(str(path), "w")
-    stream = container.add_stream("mpeg4", rate=25)
-    stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-    for _ in range(count):
-        frame = av.VideoFrame.from_ndarray(np.zeros((48, 64, 3), np.uint8), "rgb24")
-        container.mux(stream.encode(frame))
-    container.mux(stream.encode())
-    container.close()
-    return path
-
-
 def test_colour_video_and_what_is_no_video_are_reported(tmp_path: Path) -> None:
-    with pytest.raises(ToftrackError, match="colour or 8-bit images.*mpeg4 yuv420p.*16 bits"):
-        Replay(write_colour(tmp_path / "a.mp4"))
+    video = VideoFile(tmp_path / "a.mp4", 25.0, (64, 48))
+    for _ in range(5):
+        video.add(np.zeros((48, 64, 3), np.uint8))
+    video.close()
+    with pytest.raises(ToftrackError, match="colour or 8-bit images.*yuv420p.*16 bits"):
+        Replay(tmp_path / "a.mp4")
     (tmp_path / "b.mp4").write_bytes(b"nonsense" * 99)
     with pytest.raises(ToftrackError, match="b.mp4' cannot be read as a video"):
         Replay(tmp_path / "b.mp4")
