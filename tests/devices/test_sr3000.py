@@ -1,6 +1,7 @@
 """The SR3000: the real driver against a virtual camera that misbehaves in every way known."""
 
 import gc
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -61,6 +62,7 @@ def sample() -> list[Any]:
 def assert_released(device: Sr3000) -> None:
     assert device.emulator.open_handles == set()
     assert device.emulator.misuse == []
+    assert "sr3000-reader" not in [thread.name for thread in threading.enumerate()]
 
 
 def assert_is_the_sample(device: Sr3000, frames: list[Any], sample: list[Any]) -> None:
