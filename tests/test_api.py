@@ -1,7 +1,5 @@
 """toftrack in a program of one's own: the names, the configuration, images, several trackers."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import pydoc

@@ -1,7 +1,5 @@
 """Numbers of settings: what cannot be meant is refused in one sentence."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The version is said in three places, which agree."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 

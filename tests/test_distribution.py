@@ -1,7 +1,5 @@
 """What a wheel, a source archive and an editable installation hold."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

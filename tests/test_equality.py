@@ -1,7 +1,5 @@
 """Objects that hold arrays are equal only to themselves: `==` of tensors has no truth value."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A forked process tracks, whatever the one before did, and ends."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import signal

@@ -1,7 +1,5 @@
 """What README.md and docs/ show works: programs run, and commands are commands that there are."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import importlib.util

@@ -1,7 +1,5 @@
 """What is wrong with the cache of the kernels costs compiling and a sentence, no run."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pickle

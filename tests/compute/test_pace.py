@@ -1,7 +1,5 @@
 """The time from one frame to the next."""
 
-from __future__ import annotations
-
 import pytest
 
 from toftrack.compute.pace import FRAME_S, elapsed_s

@@ -1,7 +1,5 @@
 """Quality follows the time that frames take under a budget, and never changes without one."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable, Iterable

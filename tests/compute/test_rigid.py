@@ -1,7 +1,5 @@
 """Rigid motions: what they mean, and the compiled ones against the reference."""
 
-from __future__ import annotations
-
 import math
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Rotations: the same as roma's, at every angle."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

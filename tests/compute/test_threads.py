@@ -1,7 +1,5 @@
 """Who may use how many threads, and how they share tasks."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

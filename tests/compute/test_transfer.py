@@ -1,7 +1,5 @@
 """Copies between the host and a device keep values and types."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

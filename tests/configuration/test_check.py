@@ -1,7 +1,5 @@
 """Overrides that cannot be meant: one sentence, before anything slow."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every file of the configuration composes, and what it describes can be made."""
 
-from __future__ import annotations
-
 import csv
 import sys
 from pathlib import Path

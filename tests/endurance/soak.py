@@ -11,8 +11,6 @@ handles are more in the last quarter than in the first one, or if the run failed
 is Linux.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -1,7 +1,5 @@
 """Runs that are ended at random moments: whatever was done until then is there, or is recovered."""
 
-from __future__ import annotations
-
 import json
 import random
 import signal

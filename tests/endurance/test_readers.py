@@ -1,7 +1,5 @@
 """Whatever a file holds, its reader reads it or refuses it with one sentence."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -1,7 +1,5 @@
 """A live run over an emulated camera that fails now and then: it ends, and nothing grows."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Whatever an image, K and time are, a step tells of a hand or none, or refuses in one sentence."""
 
-from __future__ import annotations
-
 import os
 from datetime import timedelta
 from typing import Any

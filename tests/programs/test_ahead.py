@@ -1,7 +1,5 @@
 """On the first run of a machine, a second process compiles half of the kernels."""
 
-from __future__ import annotations
-
 import gc
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The command line: one clear sentence for every error, and sweeps that carry on."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

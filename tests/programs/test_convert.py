@@ -1,7 +1,5 @@
 """Converting, recording, and folders of images: nothing is lost that need not be."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Ctrl-C in the first second: whatever is being imported, the status is 130, with no traceback."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

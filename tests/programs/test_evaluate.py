@@ -1,7 +1,5 @@
 """`toftrack evaluate` on a tiny data set."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`toftrack export RUN --to ...`: the file goes into the run's folder."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

@@ -1,7 +1,5 @@
 """The figures of a finished run: what they count, what they show, and how the command fails."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """`toftrack gesture`: gestures of one's own from a recording, and their file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """toftrack.track: the estimates and results of a recording or device in a program of one's own."""
 
-from __future__ import annotations
-
 import csv
 import errno
 import json

@@ -1,7 +1,5 @@
 """A run with a device that does not wait: what was dropped is told, and is no loss of the hand."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

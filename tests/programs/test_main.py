@@ -1,7 +1,5 @@
 """The command `toftrack`: its programs, its help, and recordings given by name."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

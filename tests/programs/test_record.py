@@ -1,7 +1,5 @@
 """`toftrack record`, `recover` of its files, and what a run keeps with record=FILE."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`toftrack recover` on a folder of a stranger: nothing elsewhere changes, nothing becomes less."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from pathlib import Path

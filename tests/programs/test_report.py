@@ -1,7 +1,5 @@
 """The report of a sweep: gathering jobs, means and spreads, failures, the table and the plot."""
 
-from __future__ import annotations
-
 import csv
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Requests to end a program: obeyed at once, after what must be whole, or not again."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

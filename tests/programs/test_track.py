@@ -1,7 +1,5 @@
 """`python track.py` from end to end: what it writes, what it says, and how it fails."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -9,8 +9,6 @@ Tracks the packaged sample, tests/data/guards (the side told) and tests/data/emp
 and compares their means over seeds with BOUNDS: docs/lab/guards.md says where they come from.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import sys

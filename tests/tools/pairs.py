@@ -9,8 +9,6 @@ FOLDER/pairs_REAL.png: real hands, and those drawn ones whose keypoints, by the 
 alike about the palm. Real images have no licence: the folder must lie outside this repository.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 from pathlib import Path

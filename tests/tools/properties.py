@@ -8,8 +8,6 @@ chosen frame, one at a time. Printed is a table in Markdown, docs/real_images.md
 images get what real ones have (noise, missing edges, ...), real ones lose it (smoothed, no arm).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from concurrent.futures import ProcessPoolExecutor

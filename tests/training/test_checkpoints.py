@@ -1,7 +1,5 @@
 """What a training goes on from: its own checkpoint, and the weights of another."""
 
-from __future__ import annotations
-
 import pickle
 from pathlib import Path
 

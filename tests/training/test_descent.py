@@ -1,7 +1,5 @@
 """Training from nothing: the same from a seed, and by one command."""
 
-from __future__ import annotations
-
 import ctypes
 import json
 import os

@@ -1,7 +1,5 @@
 """The fit of the confidence: on errors that are made up, so that what is right is known."""
 
-from __future__ import annotations
-
 from argparse import Namespace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What stands about in whole training images and is no hand."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hands that hold things: the fingers touch them, and nothing is a phone or a hammer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

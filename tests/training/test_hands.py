@@ -1,7 +1,5 @@
 """Posed hands: held as people hold what they show."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Training images: what is said of them is what they show."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

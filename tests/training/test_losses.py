@@ -1,7 +1,5 @@
 """What the networks are trained for: nothing is lost by the truth, and a little training helps."""
 
-from __future__ import annotations
-
 import pytest
 import roma
 import torch

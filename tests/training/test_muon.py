@@ -1,7 +1,5 @@
 """The optimiser: orthogonal steps for matrices, AdamW's for all else."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from torch import nn

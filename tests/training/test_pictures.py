@@ -1,7 +1,5 @@
 """Pictures of scenes: where the ellipsoids are, and what a sensor makes of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

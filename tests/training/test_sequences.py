@@ -1,7 +1,5 @@
 """Recordings of random scenes: the truth lies within what is rendered."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 from helpers.detection import small_bank

@@ -1,7 +1,5 @@
 """Hands to train on: sizes of people, and one kinematics for all."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

@@ -1,7 +1,5 @@
 """Poses that people show: of the frequencies that are written down, and as people make them."""
 
-from __future__ import annotations
-
 import torch
 from helpers.detection import dice
 

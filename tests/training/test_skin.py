@@ -1,7 +1,5 @@
 """Skin: one smooth surface about the bones, closed between the fingers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
