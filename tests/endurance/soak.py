@@ -1,7 +1,7 @@
 """A long live run under observation: does anything grow?
 
     python tests/endurance/soak.py --minutes 20
-    python tests/endurance/soak.py --minutes 60 --stream websocket --hands 2 --source TWO_HANDS.npz
+    python tests/endurance/soak.py --stream websocket hands=2 device.emulated.source=/FILE.npz
 
 The tracker follows an emulated SR3000 at the camera's pace, in a process of its own. Each 50th
 request to the camera goes wrong, in all ways in turn; a visitor watches the page and comes anew
@@ -24,9 +24,8 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from websockets.exceptions import WebSocketException
@@ -56,63 +55,40 @@ _MOST_COUNT = 1
 """Threads and handles that may be more: a visitor comes and goes."""
 
 
-@dataclass(frozen=True)
-class Sample:
-    """The process at a moment."""
+class Sample(NamedTuple):
+    """The process at a moment; its resident memory."""
 
     memory_mb: float
-    """Resident."""
     threads: int
     handles: int
 
 
-@dataclass(frozen=True)
-class Observation:
-    """What was seen of a run from its hundredth frame on."""
+class Observation(NamedTuple):
+    """What was seen of a run from its hundredth frame on.
 
-    samples: tuple[Sample, ...]
+    lines: that arrived by datagrams, or by the websocket.
+    status: with which the program ended, 143 as it should be; None: it did not end.
+    """
+
+    samples: list[Sample]
     lines: int
-    """That arrived by datagrams, or by the websocket."""
     pictures: int
     visits: int
     status: int | None
-    """With which the program ended; 143 is as it should be. None: it did not end."""
-    shutdown_s: float
-    """How long that took."""
-    written_mb: float
-    """Size of the run's files at the end."""
-
-    def grown(self) -> list[str]:
-        """What is larger in the last quarter of the time than in the first one."""
-        quarter = max(1, len(self.samples) // 4)
-        return grown(self.samples[:quarter], self.samples[-quarter:])
 
 
-def grown(first: Sequence[Sample], last: Sequence[Sample]) -> list[str]:
-    """What of memory, threads and handles is larger in the last samples, by their medians."""
-
-    def median(samples: Sequence[Sample], name: str) -> float:
-        return float(np.median([getattr(sample, name) for sample in samples]))
-
-    limits = {
-        "memory_mb": median(first, "memory_mb") * (1 + _MOST_MEMORY),
-        "threads": median(first, "threads") + _MOST_COUNT,
-        "handles": median(first, "handles") + _MOST_COUNT,
-    }
-    return [name for name, limit in limits.items() if median(last, name) > limit]
+def grown(samples: Sequence[Sample]) -> list[str]:
+    """What is larger in the last quarter of the time than in the first one, by the medians."""
+    quarter = max(1, len(samples) // 4)
+    first, last = (np.median(part, 0) for part in (samples[:quarter], samples[-quarter:]))
+    limits = first * (1 + _MOST_MEMORY, 1, 1) + (0, _MOST_COUNT, _MOST_COUNT)
+    return [name for name, more in zip(Sample._fields, last > limits, strict=True) if more]
 
 
-def soak(
-    minutes: float,
-    folder: Path,
-    reported: Callable[[str], None] = print,
-    stream: str = "udp",
-    overrides: Sequence[str] = (),
-) -> Observation:
-    """Run the tracker in a folder and observe it for so long.
+def soak(minutes: float, folder: Path, stream: str, overrides: Sequence[str]) -> Observation:
+    """Run the tracker in a folder, with overrides besides OVERRIDES, and observe it for so long.
 
-    reported: gets a line a sample.  stream: one of STREAMS.  overrides: of the run besides
-        OVERRIDES.
+    stream: one of STREAMS.
     """
     ended, words = threading.Event(), folder / "err.txt"
     arrivals: list[int] = []
@@ -145,15 +121,11 @@ def soak(
                 url = _until(lambda: _found(r"live view: http(://[^#]+)#", words), program)
                 threads.submit(_visit, f"ws{url}live", _PICTURES_A_VISIT, watch, visits, ended)
                 _until(lambda: len(arrivals) > _WARM_FRAMES, program)
-                samples = _samples(program, 60 * minutes, arrivals, reported)
-                asked_s = time.monotonic()
+                samples = _samples(program, 60 * minutes, arrivals)
                 status = _ended(program)
-                shutdown_s = time.monotonic() - asked_s
             finally:
                 ended.set()
-    written_mb = sum(file.stat().st_size for file in (folder / "run").iterdir()) / 1e6
-    counts = len(arrivals), len(pictures), len(visits)
-    return Observation(tuple(samples), *counts, status, shutdown_s, written_mb)
+    return Observation(samples, len(arrivals), len(pictures), len(visits), status)
 
 
 def _ended(program: subprocess.Popen) -> int | None:
@@ -199,12 +171,7 @@ def _found(pattern: str, words: Path) -> str:
     return found[1] if found else ""
 
 
-def _samples(
-    program: subprocess.Popen,
-    seconds: float,
-    arrivals: list[int],
-    reported: Callable[[str], None],
-) -> list[Sample]:
+def _samples(program: subprocess.Popen, seconds: float, arrivals: list[int]) -> list[Sample]:
     samples, began = [], time.monotonic()
     every_s = min(10.0, seconds / 16)
     for number in range(int(seconds / every_s) + 1):
@@ -212,21 +179,17 @@ def _samples(
         if program.poll() is not None:
             raise RuntimeError(f"the tracker ended with status {program.returncode}")
         samples.append(sample := _sample(program.pid))
-        reported(
-            f"{number * every_s:6.0f} s  {sample.memory_mb:6.1f} MB  {sample.threads} threads  "
-            f"{sample.handles} handles  {len(arrivals)} frames"
-        )
+        print(f"{number * every_s:6.0f} s  {sample}  {len(arrivals)} frames", flush=True)
     return samples
 
 
 def _sample(process: int) -> Sample:
     folder = Path(f"/proc/{process}")
-    status = dict(
-        line.split(":", 1) for line in (folder / "status").read_text().splitlines() if ":" in line
+    status = (folder / "status").read_text()
+    kilobytes, threads = (
+        int(re.search(rf"^{name}:\s+(\d+)", status, re.M)[1]) for name in ("VmRSS", "Threads")
     )
-    memory_mb = int(status["VmRSS"].split()[0]) / 1024
-    handles = sum(1 for _ in (folder / "fd").iterdir())
-    return Sample(memory_mb, int(status["Threads"]), handles)
+    return Sample(kilobytes / 1024, threads, len(list((folder / "fd").iterdir())))
 
 
 def _listen(listener: socket.socket, arrivals: list[int], ended: threading.Event) -> None:
@@ -262,28 +225,15 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Does anything grow in a long live run?")
     parser.add_argument("--minutes", type=float, default=20.0, help="how long; 20 if not given")
     parser.add_argument("--stream", choices=STREAMS, default=STREAMS[0], help="udp if not given")
-    parser.add_argument("--hands", type=int, choices=(1, 2, 4), default=1, help="1 if not given")
-    parser.add_argument("--source", type=Path, help="what the camera sees; the sample if not given")
-    given = parser.parse_args()
-    overrides = [f"hands={given.hands}"]
-    if given.source is not None:
-        overrides.append(f"device.emulated.source={given.source.resolve()}")
+    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of the tracker")
+    given = parser.parse_intermixed_args()
     with tempfile.TemporaryDirectory() as folder:
-        observation = soak(
-            given.minutes,
-            Path(folder),
-            lambda line: print(line, flush=True),
-            given.stream,
-            overrides,
-        )
+        observation = soak(given.minutes, Path(folder), given.stream, given.overrides)
         words = (Path(folder) / "err.txt").read_text()
     seen = f"{observation.pictures} pictures were seen in {observation.visits} visits"
     print(f"{observation.lines} lines came, {seen}")
-    print(
-        f"the ending took {observation.shutdown_s:.1f} s; {observation.written_mb:.0f} MB of files"
-    )
     print(*re.findall(r"sr3000: frames: .*", words)[-1:])
-    problems = [f"{name} grew" for name in observation.grown()]
+    problems = [f"{name} grew" for name in grown(observation.samples)]
     if observation.status != 143:
         problems.append(f"the tracker ended with status {observation.status}\n{words[-5000:]}")
     print("; ".join(problems) or "nothing grew")

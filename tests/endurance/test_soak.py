@@ -1,7 +1,6 @@
 """A live run over an emulated camera that fails now and then: it ends, and nothing grows."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,10 +10,10 @@ pytestmark = pytest.mark.endurance
 
 
 def test_what_grows_is_named() -> None:
-    first = [soak.Sample(700.0, 7, 9)] * 5
-    assert soak.grown(first, [replace(first[0], memory_mb=720.0, threads=8)] * 5) == []
+    first = soak.Sample(700.0, 7, 9)
+    assert soak.grown([first] * 5 + [first._replace(memory_mb=720.0, threads=8)] * 5) == []
     for name, more in (("memory_mb", 740.0), ("threads", 9), ("handles", 11)):
-        assert soak.grown(first, [replace(first[0], **{name: more})] * 5) == [name]
+        assert soak.grown([first] * 5 + [first._replace(**{name: more})] * 5) == [name]
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
@@ -22,10 +21,10 @@ def test_what_grows_is_named() -> None:
 def test_a_live_run_with_faults_a_visitor_and_a_stream(
     tmp_path: Path, stream: str, hands: int
 ) -> None:
-    observation = soak.soak(0.3, tmp_path, lambda line: None, stream, [f"hands={hands}"])
+    observation = soak.soak(0.3, tmp_path, stream, [f"hands={hands}"])
     words = (tmp_path / "err.txt").read_text()
     assert observation.status == 143, words[-2000:]
-    assert observation.grown() == []
+    assert soak.grown(observation.samples) == []
     assert observation.pictures > 0 < observation.visits
     assert observation.lines > 0
     for name in ("track.npz", "summary.json", "track.jsonl"):
