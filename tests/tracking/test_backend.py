@@ -7,7 +7,6 @@ from toftrack.compute import rigid, rigid_numba
 from toftrack.errors import ToftrackError
 from toftrack.hand.shape import default_hand_shape
 from toftrack.render.numba.scorer import NumbaScorer
-from toftrack.render.scoring import disc_square
 from toftrack.render.torch_scorer import TorchScorer
 from toftrack.tracking.backend import choose_backend, make_scorer
 
@@ -46,9 +45,3 @@ def test_on_a_device_no_slow_back_end_is_taken_without_being_asked_for() -> None
     """Any device but the CPU stands for CUDA: triton is looked for before anything runs there."""
     with pytest.raises(ToftrackError, match="renderer=torch, which is slow, or compute=cpu"):
         choose_backend("auto", torch.device("cuda"))
-
-
-def test_a_hand_that_comes_nearer_has_few_discs() -> None:
-    radii = torch.linspace(3.0, 6.0, 1000).tolist()
-    squares = {disc_square(radius, 144, 176) for radius in radii}
-    assert squares == set(range(9, 37))

@@ -1,5 +1,6 @@
 """How surely an estimate and its joints are right, and what follows for the estimate's track."""
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -90,11 +91,10 @@ def features_of(
 
 
 def test_features_are_of_order_one_and_finite() -> None:
-    for found in (PALM_M, PALM_M + 100.0, PALM_M * 1e-6, PALM_M * -1.0):
-        for depth in (0 * WALL, WALL):
-            for score in (0.0, 1.0):
-                values = features_of(found, depth, score).values()
-                assert all(math.isfinite(value) and abs(value) < 15 for value in values)
+    hands = PALM_M, PALM_M + 100.0, PALM_M * 1e-6, PALM_M * -1.0
+    for found, depth, score in itertools.product(hands, (0 * WALL, WALL), (0.0, 1.0)):
+        values = features_of(found, depth, score).values()
+        assert all(math.isfinite(value) and abs(value) < 15 for value in values)
 
 
 def test_an_estimate_as_the_networks_see_it_has_good_features_and_more_confidence() -> None:
@@ -151,31 +151,25 @@ def judged(
 
 
 @pytest.mark.parametrize(
-    ("patience", "dt_s", "frames"),
+    ("patience", "dt_s", "likely", "frames"),
     [
-        (1, FRAME_S, 1),
-        (5, FRAME_S, 5),
-        (0, FRAME_S, None),
-        (5, FRAME_S / 2, 9),  # 1 + 8 halves
-        (5, 0.5, 3),  # 1 + 2 + 2: what was dropped was not doubtful
+        (1, FRAME_S, None, 1),
+        (5, FRAME_S, None, 5),
+        (5, FRAME_S, 4, 10),  # one frame that is not doubtful begins the patience anew
+        (0, FRAME_S, None, None),
+        (5, FRAME_S / 2, None, 9),  # 1 + 8 halves
+        (5, 0.5, None, 3),  # 1 + 2 + 2: what was dropped was not doubtful
     ],
 )
 def test_a_doubtful_track_ends_after_its_patience(
-    patience: int, dt_s: float, frames: int | None
+    patience: int, dt_s: float, likely: int | None, frames: int | None
 ) -> None:
     track, ends = followed(), []
-    for _ in range(20):
-        track = replace(track, doubtful=judged(track, 0.05, dt_s).doubtful)
+    for frame in range(20):
+        status = judged(track, 0.2 if frame == likely else 0.05, dt_s)
+        track = replace(track, doubtful=status.doubtful)
         ends.append(track_ends(track, False, patience))
     assert (1 + ends.index(True) if any(ends) else None) == frames
-
-
-def test_a_frame_that_is_not_doubtful_begins_the_patience_anew() -> None:
-    track = followed()
-    for chance in [0.05] * 4 + [0.2] + [0.05] * 4:
-        track = replace(track, doubtful=judged(track, chance).doubtful)
-        assert not track_ends(track, False, 5)
-    assert track_ends(replace(track, doubtful=judged(track, 0.05).doubtful), False, 5)
 
 
 @pytest.mark.parametrize(
@@ -296,15 +290,13 @@ def test_a_row_of_weights_is_of_its_column_and_kind() -> None:
 
 
 def test_features_of_joints_and_what_follows_are_finite_whatever_is_seen() -> None:
-    for joints in (joints_at(), joints_at() + 100, joints_at() * 1e-6, -joints_at()):
-        for depth in (WALL, 0 * WALL):
-            for score, odds in ((0.0, -1e3), (1.0, 1e3)):
-                found = joint_features_of(
-                    joints.astype(np.float32), depth, score=score, log_odds=odds
-                )
-                sigma, near = believed(found)
-                assert np.isfinite(sigma).all() and (sigma > 0).all()
-                assert ((near >= 0) & (near <= 1)).all()
+    hands = joints_at(), joints_at() + 100, joints_at() * 1e-6, -joints_at()
+    for joints, depth, score in itertools.product(hands, (WALL, 0 * WALL), (0.0, 1.0)):
+        odds = 2e3 * score - 1e3
+        found = joint_features_of(joints.astype(np.float32), depth, score=score, log_odds=odds)
+        sigma, near = believed(found)
+        assert np.isfinite(sigma).all() and (sigma > 0).all()
+        assert ((near >= 0) & (near <= 1)).all()
 
 
 def test_a_joint_away_from_its_keypoint_speaks_against_its_finger() -> None:

@@ -99,17 +99,6 @@ def test_a_restart_forgets_all_but_the_random_numbers_and_the_count_of_frames() 
     assert empty.index == 9 and np.isnan(empty.joints_m).all() and empty.gesture == ""
 
 
-def test_what_a_step_saw_is_kept_with_the_time_of_its_stages() -> None:
-    tracker, scene = quick(), sample()
-    estimate = tracked(tracker, scene, range(1))[0]
-    seconds = tracker.hands.insights[0].seconds
-    stages = {"detector", "filter: scoring", "filter: rest", "refinement", "rest"}
-    assert stages == set(seconds)
-    assert all(value > 0 for value in seconds.values())
-    assert sum(seconds.values()) <= estimate.compute_s
-    assert tracker.hands.insights[0].particles.shape == (80, 10)
-
-
 @pytest.mark.parametrize(
     ("every", "fps"), [(2, 25.0), (5, 25.0), (1, 50.0), (1, 12.5)], ids=lambda value: f"{value:g}"
 )

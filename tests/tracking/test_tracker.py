@@ -133,23 +133,14 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
     assert run.tracker.shape.side == "left"
 
 
-@pytest.mark.parametrize(
-    ("override", "words"),
-    [
-        ("filter.resampling=residual", "filter.resampling=residual is unknown; give one of"),
-        ("filter.bounds=clip", "filter.bounds=clip is unknown"),
-        ("filter.passes=1.5", "filter.passes=1.5 is not possible; give a whole number"),
-        ("lost.believe=60", "lost.believe=60 is not possible; give a number of at least 0 and at"),
-        ("compute=tpu", "compute=tpu is unknown"),
-        ("hand.side=both", "hand.side"),
-    ],
-)
-def test_a_setting_that_makes_no_sense_is_one_clear_error(override: str, words: str) -> None:
-    with pytest.raises(Exception) as caught:
+WRONG = "filter.resampling=residual filter.bounds=clip filter.passes=1.5 lost.believe=60"
+
+
+@pytest.mark.parametrize("override", [*WRONG.split(), "compute=tpu", "hand.side=both"])
+def test_a_setting_that_makes_no_sense_is_named(override: str) -> None:
+    with pytest.raises(Exception, match=override) as caught:
         make_tracker(override)
-    chain = (caught.value, caught.value.__cause__)
-    reported = [str(error) for error in chain if isinstance(error, ToftrackError)]
-    assert reported and words in reported[0]
+    assert isinstance(caught.value.__cause__ or caught.value, ToftrackError)
 
 
 def test_a_filter_of_another_size_tracks_too() -> None:
