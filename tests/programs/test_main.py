@@ -90,8 +90,6 @@ def test_a_program_s_status_and_errors_are_those_of_the_command(capsys, tmp_path
     assert front.main(["report", str(tmp_path)]) == 1
     assert front.main(["convert", str(tmp_path / "gone.npz"), str(tmp_path / "x.srs")]) == 1
     assert "gone.npz" in capsys.readouterr().err.splitlines()[-1]
-    assert front.main(["figures", "--help"]) == 0
-    assert capsys.readouterr().out.startswith("usage: toftrack figures ")
 
 
 @pytest.mark.parametrize("name", [*ODD, *ODDER])

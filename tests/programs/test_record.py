@@ -24,6 +24,7 @@ from toftrack.recordings.npz import read_recording
 from toftrack.recordings.recorder import Recorder
 
 FEW = 5
+SR3000 = ("device=sr3000", "device.transport=emulated")
 TRACK = ("view=none", "experiment=paper", *QUICK)
 
 
@@ -161,10 +162,8 @@ def test_the_command_records_a_camera_of_ones_own(
 def test_at_the_limit_the_command_ends_well(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for name, kind in (("a.npz", "device=sr3000"), ("a.srs", "device=sr3000")):
-        path = tmp_path / name
-        settings = (kind, "device.transport=emulated", "device.emulated.fps=200")
-        assert record(str(path), *settings, "--limit", "0.0004") == 0
+    for path in (tmp_path / "a.npz", tmp_path / "a.srs"):
+        assert record(str(path), *SR3000, "device.emulated.fps=200", "--limit", "0.0004") == 0
         reported = capsys.readouterr()
         assert "its limit, 0.0004 GB" in reported.err
         assert f"{path}: " in reported.out
@@ -177,10 +176,10 @@ def test_who_says_how_many_frames_gets_them(
 ) -> None:
     monkeypatch.setattr(recorder, "_GIGABYTE", 1e5)  # the default is reached by the second frame
     path = tmp_path / "a.npz"
-    settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
-    assert record(str(path), *settings, "--frames", "9") == 0
+    nine = (str(path), *SR3000, "device.emulated.fps=200", "--frames", "9")
+    assert record(*nine) == 0
     assert Replay(path).frames == 9
-    assert record(str(path), *settings, "--frames", "9", "++record_limit_gb=1", "--overwrite") == 0
+    assert record(*nine, "++record_limit_gb=1", "--overwrite") == 0
     assert Replay(path).frames < 9
 
 
@@ -218,8 +217,7 @@ def sized(path: Path, least: int) -> bool:
 def test_ctrl_c_leaves_a_whole_file(tmp_path: Path) -> None:
     path = tmp_path / "hand.npz"
     with interrupted_when(lambda: sized(tmp_path / "hand.npz.part", 200_000)):
-        settings = ("device=sr3000", "device.transport=emulated", "device.emulated.loop=true")
-        assert record(str(path), *settings) == 130
+        assert record(str(path), *SR3000, "device.emulated.loop=true") == 130
     assert len(read_recording(path)) > 2
     assert [file.name for file in tmp_path.iterdir()] == ["hand.npz"]
 
@@ -228,9 +226,8 @@ def test_after_kill_9_the_frames_until_then_are_recovered(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, part = tmp_path / "hand.npz", tmp_path / "hand.npz.part"
-    settings = ("device=sr3000", "device.transport=emulated", "device.emulated.fps=200")
-    record_it = ("record", str(path), *settings, "device.emulated.loop=true")
-    killed_when(lambda: sized(part, 2_000_000), *record_it)
+    endless = ("device.emulated.fps=200", "device.emulated.loop=true")
+    killed_when(lambda: sized(part, 2_000_000), "record", str(path), *SR3000, *endless)
     size = part.stat().st_size
     recover.main([str(path)])
     replay = Replay(path)

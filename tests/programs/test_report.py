@@ -13,18 +13,17 @@ from toftrack.errors import ToftrackError
 from toftrack.programs.report import Group, group_runs, main, read_runs, report, sweep_figure
 
 
-def job(
-    folder: Path, number: int, overrides: list[str], error: float | None, ms: float = 20.0
-) -> Path:
-    """A job's folder as track.py leaves it; no truth without an error."""
+def job(folder: Path, number: int, overrides: list[str], **summary: object) -> None:
+    """A job's folder as its program leaves it."""
     path = folder / str(number)
     (path / ".hydra").mkdir(parents=True)
     (path / ".hydra" / "overrides.yaml").write_text("".join(f"- {o}\n" for o in overrides))
-    summary = {"frames": 10, "median_ms": ms, "mean_score": 0.9, "metrics": {"mean_mm": error}}
-    if error is None:
-        del summary["metrics"]
     (path / "summary.json").write_text(json.dumps(summary))
-    return path
+
+
+def tracked(error: float, ms: float = 20.0) -> dict[str, object]:
+    """The summary of a run over a recording with truth."""
+    return {"frames": 10, "median_ms": ms, "metrics": {"mean_mm": error}}
 
 
 @pytest.fixture
@@ -35,7 +34,8 @@ def sweep(tmp_path: Path) -> Path:
         for seed in (0, 1):
             for name, harder in (("one", 0.0), ("two", 4.0)):
                 given = [f"pose_space={space}", f"seed={seed}", f"device.path=d/{name}.npz"]
-                job(tmp_path, number, [*given, "view=none"], base + 2 * seed + harder, ms)
+                found = tracked(base + 2 * seed + harder, ms)
+                job(tmp_path, number, [*given, "view=none"], **found)
                 number += 1
     return tmp_path
 
@@ -66,7 +66,7 @@ def test_the_report_writes_a_table_a_csv_and_a_plot(sweep: Path, capsys) -> None
 def test_recordings_of_one_name_are_told_apart_by_their_folders(tmp_path: Path, capsys) -> None:
     paths = ("mine/one.npz", "yours/one.npz", "yours/one.srs", "./mine/../mine/one.npz")
     for number, path in enumerate(paths):
-        job(tmp_path, number, [f"device.path=data/{path}"], 10.0 + number)
+        job(tmp_path, number, [f"device.path=data/{path}"], **tracked(10.0 + number))
     main([str(tmp_path)])
     text = capsys.readouterr().out
     assert text.count("mine/one") == 1 and "yours/one.npz" in text and "yours/one.srs" in text
@@ -117,8 +117,8 @@ def test_what_jobs_say_cannot_command_the_terminal(sweep: Path, capsys) -> None:
 
 
 def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
-    job(tmp_path, 0, ["seed=0"], None)
-    job(tmp_path, 1, ["seed=1"], None)
+    for seed in range(2):
+        job(tmp_path, seed, [f"seed={seed}"], mean_score=0.9)
     _, (group,) = report(tmp_path)
     assert group.error == pytest.approx(0.9) and group.settings == "all alike"
     assert "mean_score" in capsys.readouterr().out
@@ -126,8 +126,7 @@ def test_without_truth_the_score_is_compared(tmp_path: Path, capsys) -> None:
 
 def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: Path) -> None:
     for number, kind in enumerate(("pca", "lle")):
-        path = job(tmp_path, number, [f"pose_space={kind}"], None)
-        (path / "summary.json").write_text(json.dumps({"reached_degrees": 5.0 + number}))
+        job(tmp_path, number, [f"pose_space={kind}"], reached_degrees=5.0 + number)
     _, groups = report(tmp_path)
     assert [group.error for group in groups] == [5.0, 6.0]
     assert (tmp_path / "sweep.csv").exists() and not (tmp_path / "sweep.png").exists()
@@ -135,11 +134,8 @@ def test_sweeps_of_training_compare_held_out_degrees_and_have_no_plot(tmp_path: 
 
 def test_spaces_are_not_compared_by_their_own_training_poses(tmp_path: Path, capsys) -> None:
     for number, figures in enumerate(({"reached_degrees": 6.2}, {})):
-        path = tmp_path / str(number)
-        (path / ".hydra").mkdir(parents=True)
-        (path / ".hydra" / "overrides.yaml").write_text(f"- pose_space.dims={6 + number}\n")
-        summary = {"training_degrees": 1.2 - number, **figures}
-        (path / "summary.json").write_text(json.dumps(summary))
+        dims = [f"pose_space.dims={6 + number}"]
+        job(tmp_path, number, dims, training_degrees=1.2 - number, **figures)
     _, groups = report(tmp_path)
     assert [group.error for group in groups] == [6.2, None]
     assert "1 of 2 runs have no reached_degrees" in capsys.readouterr().out
@@ -154,7 +150,7 @@ def test_another_figure_can_be_asked_for(sweep: Path) -> None:
 
 def test_jobs_are_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     for number in (10, 2, 1):
-        job(tmp_path, number, [f"seed={number}"], 1.0)
+        job(tmp_path, number, [f"seed={number}"])
     assert [run.name for run in read_runs(tmp_path)] == ["1", "2", "10"]
 
 
