@@ -68,10 +68,17 @@ def used(network: nn.Module, image: torch.Tensor) -> nn.Module:
     return network.eval()
 
 
-def one_hand(seed: int, pivot_m: tuple[float, float, float], left: bool = False) -> Hands:
+def random_hands(
+    n: int, seed: int, left: bool = False, pivot_m: Sequence[float] = (0.0, 0.0, 0.5)
+) -> Hands:
+    """Hands of one side about a place."""
+    places = torch.tensor([pivot_m]).expand(n, 3)
+    return posed_hands(small_bank(), places, torch.full((n,), left), dice(seed), HAND)
+
+
+def one_hand(seed: int, pivot_m: Sequence[float], left: bool = False) -> Hands:
     """A random hand about a place, without its forearm."""
-    place, side = torch.tensor([pivot_m]), torch.tensor([left])
-    hands = posed_hands(small_bank(), place, side, dice(seed), HAND)
+    hands = random_hands(1, seed, left, pivot_m)
     hands.labels[hands.labels != HAND] = -1
     return hands
 

@@ -11,12 +11,13 @@ from helpers.detection import (
     distance_to,
     intrinsics,
     plain_scenes,
+    random_hands,
     small_bank,
 )
 
 from toftrack.hand.skeleton import ANGLE_LIMITS, forward_kinematics
 from toftrack.training import hands as module
-from toftrack.training.hands import HAND, THING, posed_hands, random_grasps
+from toftrack.training.hands import THING, random_grasps
 from toftrack.training.held_things import _PHONE_M
 from toftrack.training.things_numba import BALL, BOX, CONE, RING
 
@@ -128,9 +129,7 @@ def test_distances_are_those_of_the_shapes(thing, point, distance: float) -> Non
 def test_a_thing_is_where_its_hand_is(left: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Seen from the camera, things lie beside, before or behind the hands that hold them."""
     monkeypatch.setattr(module, "HOLDING", 1.0)
-    n = 40
-    place = torch.tensor([[0.03, -0.02, 0.5]]).expand(n, 3)
-    posed = posed_hands(small_bank(), place, torch.full((n,), left), dice(1), HAND)
+    posed = random_hands(40, 1, left, (0.03, -0.02, 0.5))
     held = (posed.parts[..., 0] >= 0).any(1)
     assert float(held.float().mean()) > 0.5
     middle = (posed.parts[:, 0, 1:4] - posed.pivot_m).norm(dim=1)[held]

@@ -4,16 +4,14 @@ import math
 
 import pytest
 import torch
-from helpers.detection import dice, small_bank
+from helpers.detection import dice, random_hands
 
 from toftrack.training.hands import (
     ABOVE,
     FRONT,
-    HAND,
     HEAD,
     UPRIGHT_THUMBS,
     VIEW_SHARES,
-    posed_hands,
     random_rotations,
     random_views,
     thumb_is_up,
@@ -35,8 +33,7 @@ def test_thumbs_that_are_up_are_distinguished() -> None:
 
 
 def test_most_thumbs_that_are_up_are_upright_in_the_image() -> None:
-    place = torch.tensor([[0.0, 0.0, 0.5]]).expand(N, 3)
-    posed = posed_hands(small_bank(), place, torch.zeros(N, dtype=torch.bool), dice(2), HAND)
+    posed = random_hands(N, 2)
     up = thumb_is_up(posed.angles) & (posed.parts[:, 0, 0] < 0)
     assert up.sum() > 20
     # The hand's x axis points to the thumb, the image's y axis down.

@@ -13,13 +13,13 @@ from helpers.detection import (
     lens_of,
     one_hand,
     plain_scenes,
-    small_bank,
+    random_hands,
 )
 
 from toftrack.hand.surface import Ellipsoids
 from toftrack.render.reference import render_range_images
 from toftrack.training import pictures
-from toftrack.training.hands import BACKGROUND, FOREARM, HAND, posed_hands
+from toftrack.training.hands import BACKGROUND, FOREARM, HAND
 from toftrack.training.pictures import random_sensors, take_pictures
 from toftrack.training.scenes import Scenes
 
@@ -136,9 +136,7 @@ def test_narrow_hollows_seem_deeper_and_nothing_else_does() -> None:
 
 
 def test_a_dark_sleeve_is_not_read_and_the_hand_is() -> None:
-    hands = posed_hands(
-        small_bank(), torch.tensor([[0.0, 0.0, 0.5]]), torch.tensor([False]), dice(2), HAND
-    )
+    hands = random_hands(1, 2)
     hands.labels[hands.labels == -1] = FOREARM
     lens = lens_of(K, HEIGHT, WIDTH)
     sensors = clean_sensors(1)
@@ -166,11 +164,7 @@ def test_sensors_are_within_what_cameras_do() -> None:
 
 
 def test_a_left_hand_is_the_mirror_image_of_a_right_one() -> None:
-    place = torch.tensor([[0.0, 0.05, 0.5]])
-    right, left = (
-        posed_hands(small_bank(), place, torch.tensor([side]), dice(4), HAND)
-        for side in (False, True)
-    )
+    right, left = (random_hands(1, 4, side, (0.0, 0.05, 0.5)) for side in (False, True))
     mirror = torch.tensor([-1.0, 1.0, 1.0])
     assert torch.allclose(right.joints_m * mirror, left.joints_m, atol=1e-6)
     assert torch.allclose(right.centres_m * mirror, left.centres_m, atol=1e-6)
