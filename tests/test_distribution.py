@@ -83,9 +83,7 @@ def test_a_type_checker_in_another_folder_knows_the_types(site: Path, tmp_path: 
     assert 'Module has no attribute "make_racket"' in said
 
 
-def test_an_editable_installation_is_the_path_of_the_checkout(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_editable_installation_is_the_path_of_the_checkout(tmp_path, monkeypatch) -> None:
     """So that type checkers and editors find the package."""
     monkeypatch.chdir(ROOT)
     with zipfile.ZipFile(tmp_path / build.build_editable(str(tmp_path))) as wheel:
@@ -100,9 +98,7 @@ def test_the_wheel_says_on_which_pythons_it_runs(site: Path) -> None:
     assert named == ["3.11", "3.12", "3.13"] and said["Requires-Python"] == f">={named[0]}"
 
 
-def test_the_image_gets_all_that_the_wheel_is_made_of(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_image_gets_all_that_the_wheel_is_made_of(site: Path, tmp_path, monkeypatch) -> None:
     """What the Dockerfile copies, as there is no Docker in a test."""
     copied = re.findall(r"^COPY (.+) (\S+)$", (ROOT / "Dockerfile").read_text(), re.M)
     for names, target in copied:

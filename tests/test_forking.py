@@ -142,9 +142,7 @@ def test_a_program_that_forks_before_it_tracks_goes_on_in_both_processes() -> No
     assert process.returncode == 0
 
 
-def test_after_a_fork_of_a_process_with_a_gpu_it_is_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_a_fork_of_a_process_with_a_gpu_it_is_refused(monkeypatch) -> None:
     def init() -> None:
         raise RuntimeError("Cannot re-initialize CUDA in forked subprocess")
 

@@ -251,9 +251,7 @@ def read(printed: list[str]) -> list[int]:
     return [int(row[0]) for row in rows]
 
 
-def test_the_client_of_standard_output_gets_every_frame(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_client_of_standard_output_gets_every_frame(tmp_path, capfd) -> None:
     send("stdout", tmp_path)
     with client("stdout-client", tmp_path) as process:
         printed, _ = process.communicate(capfd.readouterr().out, timeout=60)
@@ -271,9 +269,7 @@ def test_the_client_of_datagrams_gets_every_frame(gestures: str, tmp_path: Path)
         assert read([process.stdout.readline() for _ in range(6)]) == list(range(6))
 
 
-def test_the_client_for_two_hands_prints_each_that_there_is(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_client_for_two_hands_prints_each_that_there_is(capsys, monkeypatch) -> None:
     none = no_estimate(3, 0.12, "searching", 4, 0.01)
     there = replace(none, lost=False, side="left", state=np.zeros(27), joints_m=np.ones((21, 3)))
     lines = [json_line(both) for both in ((none, none), (none, there), (there, there))]
@@ -283,9 +279,7 @@ def test_the_client_for_two_hands_prints_each_that_there_is(
     assert printed == [["3", slot, "left"] for slot in ("1", "0", "1")]
 
 
-def test_the_program_in_python_tracks(
-    capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_program_in_python_tracks(capsys, monkeypatch, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     code = block("python")
     few = code.replace('"device=sample"', '"device=sample", "device.stop=4"')

@@ -171,9 +171,7 @@ def test_compiling_is_announced_and_loading_is_not(kept: bool, folder: Path, cap
         assert all(("once on a machine" in message) == kept for message in said)
 
 
-def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_kernels_are_kept_in_the_user_s_cache_not_in_the_package(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(numba.config, "CACHE_DIR", "")
     monkeypatch.setenv("LOCALAPPDATA" if os.name == "nt" else "XDG_CACHE_HOME", str(tmp_path))
     here = compiling._private_folder()
@@ -206,17 +204,13 @@ def test_what_another_process_is_compiling_is_waited_for() -> None:
     assert values[1] == FACTOR
 
 
-def test_what_another_process_never_finishes_is_compiled_all_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_another_process_never_finishes_is_compiled_all_the_same(monkeypatch) -> None:
     monkeypatch.setattr(compiling, "_PATIENCE_S", 0.1)
     with filelock.FileLock(f"{_kept(_made())}.lock"):
         assert not _is_loaded()
 
 
-def test_where_nothing_can_be_locked_it_is_compiled_all_the_same(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_where_nothing_can_be_locked_it_is_compiled_all_the_same(monkeypatch) -> None:
     def refused(self: filelock.FileLock) -> None:
         raise OSError("no locks here")
 

@@ -81,9 +81,7 @@ def looked(
     return detector(**changes).look(scene.depth_m[0], scene.k, places, "right"), inspected
 
 
-def test_hands_are_detected_twice_at_the_places_that_were_found(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_hands_are_detected_twice_at_the_places_that_were_found(monkeypatch) -> None:
     centres = [(0, 0, 0.4), (0.2, 0, 0.5), (0, -0.2, 0.5)]
     detections, inspected = looked(monkeypatch, found_at(*centres), merit=-1e6)
     assert len(inspected) == 2 and len(detections) == 3
@@ -93,9 +91,7 @@ def test_hands_are_detected_twice_at_the_places_that_were_found(
     assert (away > 0).all(), "about the palms that the first one found"
 
 
-def test_the_place_comes_first_of_which_most_speaks_for_a_hand(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_place_comes_first_of_which_most_speaks_for_a_hand(monkeypatch) -> None:
     places = found_at((0, 0, 0.4), (0.2, 0, 0.5))
     hands, _ = looked(monkeypatch, places, merit=-1e6)
     assert {round(one.heat, 2) for one in hands} == {0.9, 0.72}

@@ -129,9 +129,7 @@ def test_weights_without_a_file_are_run_by_torch_which_is_said_once(
     assert f"there is no {weights.with_suffix('')}.{network}.onnx" in torch_runs(weights, caplog)
 
 
-def test_a_file_of_other_weights_is_not_used(
-    weights: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_of_other_weights_is_not_used(weights: Path, caplog) -> None:
     torch.manual_seed(2)
     save_weights(weights, PoseNet(4), Finder(8), {})
     assert "small.pose.onnx belongs to other weights" in torch_runs(weights, caplog)

@@ -153,9 +153,7 @@ def test_a_file_that_is_too_large(tmp_path: Path) -> None:
     refused(path, "is too large for weights of the detector")
 
 
-def test_without_networks_their_weights_are_not_read(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_without_networks_their_weights_are_not_read(monkeypatch, tmp_path) -> None:
     broken = tmp_path / "detector.npz"
     broken.write_bytes(b"no weights")
     monkeypatch.setattr(module, "DEFAULT_FILE", broken)

@@ -1,7 +1,6 @@
 """A live run over an emulated camera that fails now and then: it ends, and nothing grows."""
 
 import sys
-from pathlib import Path
 
 import pytest
 from endurance import soak
@@ -18,9 +17,7 @@ def test_what_grows_is_named() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 @pytest.mark.parametrize(("stream", "hands"), [("udp", 1), ("websocket", 2)])
-def test_a_live_run_with_faults_a_visitor_and_a_stream(
-    tmp_path: Path, stream: str, hands: int
-) -> None:
+def test_a_live_run_with_faults_a_visitor_and_a_stream(tmp_path, stream: str, hands: int) -> None:
     observation = soak.soak(0.3, tmp_path, stream, [f"hands={hands}"])
     words = (tmp_path / "err.txt").read_text()
     assert observation.status == 143, words[-2000:]

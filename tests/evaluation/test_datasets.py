@@ -87,9 +87,7 @@ def test_a_file_of_icvl_may_hold_several_sequences(tmp_path: Path) -> None:
     assert [(s.name, len(s.images)) for s in sequences] == [("a", 2), ("b", 2)]
 
 
-def test_the_two_persons_of_nyu_are_two_sequences(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_two_persons_of_nyu_are_two_sequences(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(datasets, "_TEST_FRAMES", 3)
     monkeypatch.setattr(datasets, "_FIRST_PERSON", 1)
     seen = write("NYU", tmp_path)
@@ -186,9 +184,7 @@ def test_wrong_numbers_of_labels_are_refused(
         ({"joint_xyz": np.full((3, 1, 36, 3), np.nan)}, "NaN"),
     ],
 )
-def test_other_contents_of_joint_data_are_refused(
-    content: dict, reason: str, tmp_path: Path
-) -> None:
+def test_other_contents_of_joint_data_are_refused(content: dict, reason: str, tmp_path) -> None:
     write("NYU", tmp_path, 1)
     savemat(file_of(tmp_path, ".mat"), content)
     assert reason in refusal("NYU", tmp_path)

@@ -60,9 +60,7 @@ if __name__ == "__main__":
 """
 
 
-def test_full_errors_show_the_traceback_and_the_sentence(
-    monkeypatch: pytest.MonkeyPatch, capsys
-) -> None:
+def test_full_errors_show_the_traceback_and_the_sentence(monkeypatch, capsys) -> None:
     def main() -> None:
         raise ToftrackError("the reason")
 
@@ -145,9 +143,7 @@ def test_a_folder_into_which_a_run_is_writing_stays_as_it_is(app: Path) -> None:
     assert call(app, "hydra.run.dir=deep/shared")[0] == 0 and (shared / ".hydra").exists()
 
 
-def test_a_request_that_comes_with_the_end_of_the_terminal_gives_the_status(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_request_that_comes_with_the_end_of_the_terminal_gives_the_status(monkeypatch) -> None:
     """What is finished after it says something still, and fails."""
     reader, writer = os.pipe()
     os.close(reader)

@@ -59,9 +59,7 @@ def test_there_and_back_is_bit_exact(srs: Path, tmp_path: Path, between: str) ->
     assert first.init == second.init or between != "between.srs"
 
 
-def test_the_truth_is_kept_and_depth_in_a_folder_is_millimetres(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_the_truth_is_kept_and_depth_in_a_folder_is_millimetres(tmp_path, capsys) -> None:
     whole = ROOT / "toftrack" / "data" / "sample.npz"
     with np.load(whole) as sample:
         depth = sample["depth_m"][:4]
@@ -194,9 +192,7 @@ def images(folder: Path, **changes: Any) -> Path:
     return folder
 
 
-def test_images_come_by_their_numbers_with_what_the_folder_states_or_is_given(
-    tmp_path: Path,
-) -> None:
+def test_images_come_by_their_numbers_with_what_the_folder_states_or_is_given(tmp_path) -> None:
     frames = list(Replay(images(tmp_path / "f")))
     assert [float(frame.depth[0, 0]) for frame in frames] == pytest.approx([0.1, 0.2, 1.0])
     assert [frame.timestamp_s for frame in frames] == pytest.approx([0, 0.04, 0.08])

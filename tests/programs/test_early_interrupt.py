@@ -43,9 +43,7 @@ def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.Complete
         ("hydra", ["-m", "toftrack", "record", "x"]),
     ],
 )
-def test_an_interrupt_while_a_program_is_loaded(
-    tmp_path: Path, moment: str, words: list[str]
-) -> None:
+def test_an_interrupt_while_a_program_is_loaded(tmp_path, moment: str, words: list[str]) -> None:
     reported = interrupted(tmp_path, moment, *words)
     assert reported.returncode == 130 and reported.stderr.startswith("interrupted")
     assert reported.stderr.count("\n") == 1

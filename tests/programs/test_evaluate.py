@@ -22,9 +22,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_table_and_the_file_say_how_good_it_is(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_table_and_the_file_say_how_good_it_is(folder: Path, tmp_path, capsys) -> None:
     report = tmp_path / "report.json"
     main(["MSRA15", str(folder), FEW, "--json", str(report)])
     printed = capsys.readouterr()

@@ -105,9 +105,7 @@ def test_a_bvh_lasts_as_long_as_frames_whose_times_are_whole_milliseconds(tmp_pa
 
 
 @pytest.mark.parametrize("sides", SLOTS)
-def test_a_csv_has_a_row_a_frame_and_slot(
-    sides: tuple[str | None, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_csv_has_a_row_a_frame_and_slot(sides: tuple[str | None, ...], tmp_path, capsys) -> None:
     made = run_of(tmp_path / "run", *sides) / "hand.csv"
     export.main([str(made.parent), "--to", "csv"])
     assert capsys.readouterr().out == f"  {made}\n"

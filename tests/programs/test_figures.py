@@ -232,9 +232,7 @@ def test_a_space_that_has_changed_is_reported_and_used_anew(run: Path) -> None:
     np.testing.assert_allclose(after, before, atol=1e-3)
 
 
-def test_a_live_run_gets_the_figures_that_need_no_images(
-    run: Path, undrawn: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_live_run_gets_the_figures_that_need_no_images(run: Path, undrawn: None, capsys) -> None:
     live = edited(lambda facts: facts.update(device={"device": "sr3000"}))
     change(run / "track.npz", metadata=live)
     assert [path.stem for path in draw_figures(run)] == ["course", "latent"]
@@ -272,9 +270,7 @@ def test_another_recording_is_refused(run: Path) -> None:
         draw_figures(run, run.parent / "hand.npz")
 
 
-def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
-    run: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(run: Path, capsys) -> None:
     spoilt = {"likelihood": {"_target_": "os.system", "command": "true"}}
     change(run / "track.npz", metadata=edited(lambda facts: facts["config"].update(spoilt)))
     names = {path.name for path in draw_figures(run)}
@@ -290,9 +286,7 @@ def test_a_run_says_no_code_to_execute_and_what_needs_none_is_drawn(
         read_run(run).pose_space()
 
 
-def test_the_command_answers_errors_with_a_sentence(
-    run: Path, undrawn: None, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_answers_errors_with_a_sentence(run: Path, undrawn: None, capsys) -> None:
     assert command_line.run(lambda: figures.main([str(run), "--frame", "99"])) == 1
     assert "error: the run has no frame 99; give --frame from 0 to 11" in capsys.readouterr().err
     (run / "file").touch()

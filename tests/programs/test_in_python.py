@@ -59,9 +59,7 @@ def test_the_estimates_and_results_are_those_of_the_command_line(
 
 
 @pytest.mark.parametrize("kind", ["csv", "jsonl"])
-def test_a_long_table_is_not_made_in_memory(
-    results: toftrack.Results, tmp_path: Path, kind: str
-) -> None:
+def test_a_long_table_is_not_made_in_memory(results: toftrack.Results, tmp_path, kind: str) -> None:
     of_frames = {*KINDS, "dropped"}
     many = {
         name: np.repeat(value, 100, 0) if name in of_frames else value
@@ -101,9 +99,7 @@ def test_results_are_drawn_on_the_image_of_their_frame(
     assert np.array_equal(picture, both) and len(np.unique(picture.reshape(-1, 3), axis=0)) > 100
 
 
-def test_results_become_a_table_of_pandas(
-    results: toftrack.Results, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_become_a_table_of_pandas(results: toftrack.Results, monkeypatch) -> None:
     with monkeypatch.context() as without:
         without.setitem(sys.modules, "pandas", None)
         with pytest.raises(toftrack.ToftrackError, match="needs the package pandas.*pip install"):
@@ -194,9 +190,7 @@ def test_ctrl_c_keeps_the_results_of_a_live_camera_alone() -> None:
         toftrack.PushDevice(Sample().camera, 0)
 
 
-def test_results_that_find_no_room_are_recovered_as_is_said(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_results_that_find_no_room_are_recovered_as_is_said(monkeypatch, tmp_path) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 

@@ -40,9 +40,7 @@ def test_a_machine_that_was_fast_enough_is_not_called_slow(took_s: float, words:
     assert re.match(f"49 of 51 frames were dropped{words}", pace.words())
 
 
-def test_of_a_recording_nothing_of_that_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture
-) -> None:
+def test_of_a_recording_nothing_of_that_is_said(tmp_path, capsys) -> None:
     run(tmp_path, Camera(4, every=5, live=False), *OVERRIDES, "tracker.budget_ms=0.001")
     assert "realtime" not in read_json(tmp_path / "summary.json")
     assert "too slow" not in capsys.readouterr().err

@@ -88,9 +88,7 @@ def test_what_a_camera_gave_is_replayed(
     assert "serial" not in device
 
 
-def test_a_run_keeps_what_it_saw_and_tracking_that_gives_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_keeps_what_it_saw_and_tracking_that_gives_the_same(tmp_path, monkeypatch) -> None:
     camera, path = an_sr3000(monkeypatch), tmp_path / "kept.npz"
     run(tmp_path / "live", camera, *TRACK, f"record='{path}'")
     run(tmp_path / "again", Replay(path), *TRACK)
@@ -114,9 +112,7 @@ def test_what_came_before_an_error_is_kept_with_gaps_where_frames_were_dropped(
             assert kept["index"].tolist() == list(range(0, 2 * FEW, 2))
 
 
-def test_a_recording_that_fails_does_not_end_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_recording_that_fails_does_not_end_the_run(tmp_path, monkeypatch, caplog) -> None:
     def full(*arguments: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -141,9 +137,7 @@ def record(*arguments: str) -> int:
     return command_line.run(lambda: main(arguments))
 
 
-def test_the_command_records_a_camera_of_ones_own(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_records_a_camera_of_ones_own(tmp_path, monkeypatch) -> None:
     (tmp_path / "my_conf" / "device").mkdir(parents=True)
     settings = "_target_: mine.Mine\nframes: ???\n"
     (tmp_path / "my_conf" / "device" / "mine.yaml").write_text(settings)
@@ -159,9 +153,7 @@ def test_the_command_records_a_camera_of_ones_own(
     assert len(read_recording("hand.npz")) == 3
 
 
-def test_at_the_limit_the_command_ends_well(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_at_the_limit_the_command_ends_well(tmp_path, capsys) -> None:
     for path in (tmp_path / "a.npz", tmp_path / "a.srs"):
         assert record(str(path), *SR3000, "device.emulated.fps=200", "--limit", "0.0004") == 0
         reported = capsys.readouterr()
@@ -171,9 +163,7 @@ def test_at_the_limit_the_command_ends_well(
         assert Replay(path).frames > 2
 
 
-def test_who_says_how_many_frames_gets_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_says_how_many_frames_gets_them(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(recorder, "_GIGABYTE", 1e5)  # the default is reached by the second frame
     path = tmp_path / "a.npz"
     nine = (str(path), *SR3000, "device.emulated.fps=200", "--frames", "9")
@@ -222,9 +212,7 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path: Path) -> None:
     assert [file.name for file in tmp_path.iterdir()] == ["hand.npz"]
 
 
-def test_after_kill_9_the_frames_until_then_are_recovered(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_after_kill_9_the_frames_until_then_are_recovered(tmp_path, capsys) -> None:
     path, part = tmp_path / "hand.npz", tmp_path / "hand.npz.part"
     endless = ("device.emulated.fps=200", "device.emulated.loop=true")
     killed_when(lambda: sized(part, 2_000_000), "record", str(path), *SR3000, *endless)

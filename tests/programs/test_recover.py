@@ -143,9 +143,7 @@ def test_a_new_run_lets_nothing_go_that_is_no_runs(name: str, tmp_path: Path) ->
     assert (tmp_path / name).read_bytes() == PRECIOUS
 
 
-def test_a_new_run_lets_all_of_an_earlier_one_go_and_says_so(
-    run: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_new_run_lets_all_of_an_earlier_one_go_and_says_so(run: Path, caplog) -> None:
     mine = ("hand.csv", "hand_shape_anna.json")
     for name in ("overlay.mp4", "overlay.png", "hand_shape_3.json", *mine):
         (run / name).write_bytes(PRECIOUS)

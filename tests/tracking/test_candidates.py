@@ -82,9 +82,7 @@ def test_refined_hypotheses_explain_the_image_better_than_the_track_did() -> Non
     assert float(table.log_posterior.max()) > before + 0.1
 
 
-def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_pose_that_explains_nothing_once_refined_stays_where_it_was_proposed(monkeypatch) -> None:
     view = viewed(0.0)
     mean = mean_of(view)
     far = mean.clone()

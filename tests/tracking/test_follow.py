@@ -137,9 +137,7 @@ def test_a_sure_hand_that_nobody_asked_for_is_looked_at_in_every_third_frame(
     torch.testing.assert_close(moved.pose[:, :3], THERE[:, :3], atol=0.01, rtol=0.0)
 
 
-def test_particles_are_filtered_before_a_detection_is_waited_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_particles_are_filtered_before_a_detection_is_waited_for(monkeypatch) -> None:
     order: list[str] = []
     model, start = right_hand_model(), FixedDetector.start
     score = type(model.likelihood).log_score

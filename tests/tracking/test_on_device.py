@@ -17,9 +17,7 @@ SELECTED = 4
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no CUDA device")
-def test_cuda_tracks_as_the_cpu_does_and_its_passes_wait_for_nothing(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_cuda_tracks_as_the_cpu_does_and_its_passes_wait_for_nothing(monkeypatch) -> None:
     annealed = particle_filter.annealed
 
     def without_waiting(*args: Any) -> Any:

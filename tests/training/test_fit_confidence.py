@@ -1,7 +1,6 @@
 """The fit of the confidence: on errors that are made up, so that what is right is known."""
 
 from argparse import Namespace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,9 +70,7 @@ def test_doubt_of_joints_follows_the_new_log_odds_within_each_track() -> None:
     assert (ones == 1).all()
 
 
-def test_too_few_sequences_are_one_sentence(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_few_sequences_are_one_sentence(tmp_path, monkeypatch) -> None:
     for name in ("random_sequence", "observed"):
         monkeypatch.setattr(fit_confidence, name, lambda *_: None)
     asked = Namespace(overrides=[], seed=1, sequences=1, frames=1, output=tmp_path)

@@ -62,9 +62,7 @@ def test_most_hands_hold_something_and_their_fingers_are_at_it() -> None:
     assert np.percentile(deepest, 5) > 0.0
 
 
-def in_palm(
-    opposed: float, tries: int, monkeypatch: pytest.MonkeyPatch
-) -> tuple[np.ndarray, np.ndarray]:
+def in_palm(opposed: float, tries: int, monkeypatch) -> tuple[np.ndarray, np.ndarray]:
     """Joints of power grasps and their things, see grasps."""
     monkeypatch.setattr(module, "POWER_SHARE", 1.0)
     monkeypatch.setattr(module, "_OPENED_SHARE", 0.0)
