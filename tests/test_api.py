@@ -3,8 +3,6 @@
 import dataclasses
 import inspect
 import pydoc
-import subprocess
-import sys
 import threading
 import typing
 from functools import cache
@@ -15,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from helpers.hands import hand_estimate, lost_hand
+from helpers.programs import QUICK, python
 from helpers.tracking import sample
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -22,8 +21,6 @@ from hydra.core.global_hydra import GlobalHydra
 import toftrack
 from toftrack.configuration.compose import configuration
 from toftrack.frames.estimate import no_estimate
-
-QUICK = ("filter.particles=100",)
 
 
 def test_importing_toftrack_is_light_until_a_name_is_used(tmp_path: Path) -> None:
@@ -34,8 +31,7 @@ print([name for name in {heavy} if name in sys.modules])
 print(toftrack.__all__ == dir(toftrack))
 print(toftrack.__version__)
 """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = python("-c", code, folder=tmp_path)
     assert done.stdout.splitlines() == ["[]", "True", toftrack.__version__], done.stderr
 
 
@@ -45,8 +41,7 @@ import sys, toftrack
 toftrack.track("device=sample", "device.stop=1").results()
 print("tqdm.auto" in sys.modules)
 """
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    done = python("-c", code, folder=tmp_path)
     assert done.stdout == "False\n", done.stderr
 
 

@@ -1,21 +1,18 @@
 """What a wheel, a source archive and an editable installation hold."""
 
-import os
 import re
 import shutil
-import subprocess
-import sys
 import zipfile
 from email import message_from_bytes
 from pathlib import Path
 
 import pytest
+from helpers.programs import python
+from helpers.tracking import ROOT
 
 pytest.importorskip("hatchling", reason="hatchling is not installed")
 from hatchling import build
 from hatchling.builders.sdist import SdistBuilder
-
-ROOT = Path(__file__).parents[1]
 
 
 def _files(folder: str) -> set[str]:
@@ -42,13 +39,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _python(site: Path, folder: Path, *words: str) -> str:
-    done = subprocess.run(
-        [sys.executable, *words],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(site)},
-        capture_output=True,
-        text=True,
-    )
+    done = python(*words, folder=folder, PYTHONPATH=str(site))
     return done.stdout + done.stderr
 
 

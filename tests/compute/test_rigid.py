@@ -1,14 +1,13 @@
 """Rigid motions: what they mean, and the compiled ones against the reference."""
 
 import math
-import os
-import subprocess
-import sys
 
 import numpy as np
 import pytest
 import roma
 import torch
+from helpers.programs import python
+from helpers.tracking import ROOT
 from torch import Tensor
 
 from toftrack.compute import rigid, rigid_numba
@@ -76,11 +75,8 @@ def test_triton_moves_particles_as_torch_does_as_far_as_its_interpreter_goes() -
     pytest.importorskip("triton", reason="triton is not installed")
     code = "from compute.test_rigid import *; from toftrack.compute import rigid_triton\n"
     code += "compared(rigid_triton.MOTIONS)"
-    env = {**os.environ, "TRITON_INTERPRET": "1"}
-    run = subprocess.run(
-        [sys.executable, "-c", code], env=env, capture_output=True, text=True, cwd="tests"
-    )
-    assert run.returncode == 0, run.stderr
+    done = python("-c", code, folder=ROOT / "tests", TRITON_INTERPRET="1")
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.gpu

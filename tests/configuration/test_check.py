@@ -1,13 +1,12 @@
 """Overrides that cannot be meant: one sentence, before anything slow."""
 
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
+from helpers.programs import python
 from helpers.tracking import CONF, ROOT
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
@@ -184,8 +183,8 @@ def test_the_file_that_is_no_yaml_is_named(own, tmp_path: Path, content: bytes, 
 
 
 def test_the_program_ends_without_torch_having_been_loaded(tmp_path) -> None:
-    command = [sys.executable, "-X", "importtime", str(ROOT / "track.py"), "filter.passes=0"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    words = ("-X", "importtime", str(ROOT / "track.py"), "filter.passes=0")
+    done = python(*words, folder=tmp_path)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("error: filter.passes=0 is not possible")
     assert "| torch\n" not in done.stderr

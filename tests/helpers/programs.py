@@ -1,4 +1,4 @@
-"""`python track.py` within the tests' process, which has loaded everything already."""
+"""Programs: within the tests' process, which has loaded everything already, or in their own."""
 
 import io
 import logging
@@ -61,6 +61,13 @@ def call(*arguments: str, folder: Path, program: str = "track.py") -> tuple[int,
         except SystemExit as end:
             status = end.code if isinstance(end.code, int) else 1
     return status, out.getvalue(), err.getvalue()
+
+
+def python(*words: str, folder: Path = ROOT, **environment: str) -> subprocess.CompletedProcess:
+    """What Python says in a process of its own."""
+    command, env = [sys.executable, *words], os.environ | environment
+    given = {"cwd": folder, "env": env, "timeout": 600}
+    return subprocess.run(command, **given, capture_output=True, text=True, check=False)
 
 
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:

@@ -231,9 +231,8 @@ def test_a_log_takes_any_folder_s_name_and_may_be_left_out(log, files, tmp_path:
 
 
 def test_that_matplotlib_has_found_fonts_is_not_told(tmp_path: Path) -> None:
-    words = ("toftrack", "train", "compare=[]", f"hydra.run.dir={tmp_path / 'run'}")
-    env = os.environ | {"MPLCONFIGDIR": str(tmp_path)}  # as at a user's first picture
-    done = subprocess.run([sys.executable, "-m", *words], env=env, capture_output=True, text=True)
+    words = ("-m", "toftrack", "train", "compare=[]", f"hydra.run.dir={tmp_path / 'run'}")
+    done = programs.python(*words, MPLCONFIGDIR=str(tmp_path))  # as at a user's first picture
     assert done.returncode == 0 and "fontManager" not in done.stderr
 
 
@@ -269,8 +268,7 @@ def test_exit_requests_keep_to_the_promised_statuses(
 
 @pytest.mark.parametrize("words", ["--help", "train --help", "fit-confidence --help"])
 def test_help_of_a_module_that_is_run_is_no_error(words: str) -> None:
-    command = [sys.executable, "-m", "toftrack.training", *words.split()]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = programs.python("-m", "toftrack.training", *words.split())
     assert done.returncode == 0 and "usage: python -m toftrack.training" in done.stdout
 
 

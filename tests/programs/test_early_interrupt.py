@@ -2,13 +2,13 @@
 
 import os
 import signal
-import subprocess
-import sys
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import pytest
+from helpers.programs import python
+from helpers.tracking import ROOT
 
-ROOT = Path(__file__).parents[2]
 _AT_IMPORT = """
 import os, signal, sys
 
@@ -22,18 +22,11 @@ sys.meta_path.insert(0, Interrupting())
 """
 
 
-def interrupted(tmp_path: Path, moment: str, *words: str) -> subprocess.CompletedProcess:
+def interrupted(tmp_path: Path, moment: str, *words: str) -> CompletedProcess:
     """A program that gets SIGINT where it begins to import a module."""
     (tmp_path / "sitecustomize.py").write_text(_AT_IMPORT)
     places = os.pathsep.join((str(tmp_path), str(ROOT)))
-    return subprocess.run(
-        [sys.executable, *words],
-        env=os.environ | {"PYTHONPATH": places, "INTERRUPT_AT": moment},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    return python(*words, folder=tmp_path, PYTHONPATH=places, INTERRUPT_AT=moment)
 
 
 @pytest.mark.parametrize(
@@ -53,9 +46,8 @@ def test_an_ignored_interrupt_stays_ignored(tmp_path: Path) -> None:
     """As after nohup, or in the background of a script."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        reported = interrupted(
-            tmp_path, "hydra", "-m", "toftrack", "report", str(tmp_path / "none")
-        )
+        report = ("-m", "toftrack", "report", str(tmp_path / "none"))
+        reported = interrupted(tmp_path, "hydra", *report)
     finally:
         signal.signal(signal.SIGINT, before)
     assert reported.returncode == 1 and "no folder" in reported.stderr

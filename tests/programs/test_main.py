@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.programs import python
 from helpers.tracking import ROOT, configuration
 from hydra._internal.utils import get_args_parser
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,8 +22,7 @@ ODDER = ("1,2,3.npz", "$HOME.npz", "back\\slash\\'s", "ends\\", "#", "-")
 
 @pytest.mark.parametrize("words", [["--help"], ["train", "device=x", "-h"]])
 def test_help_begins_with_what_it_does_and_three_examples_and_loads_little(words) -> None:
-    command = [sys.executable, "-X", "importtime", "-m", "toftrack", *words]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = python("-X", "importtime", "-m", "toftrack", *words)
     what, empty, *examples = done.stdout.splitlines()[:5]
     assert done.returncode == 0 and what.startswith("toftrack ") and not empty
     assert all(line.startswith("  toftrack t") for line in examples)

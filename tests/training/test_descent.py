@@ -4,8 +4,6 @@ import ctypes
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 from dataclasses import replace
 from functools import partial
@@ -148,18 +146,12 @@ def test_the_rate_rises_stays_and_falls_to_nothing() -> None:
     assert falling == sorted(falling, reverse=True) and 0 < falling[-1] < 0.002 * 0.002
 
 
-def command(folder: Path, *overrides: str) -> subprocess.CompletedProcess[str]:
-    line = [sys.executable, "-m", "toftrack.training", "train"]
-    return subprocess.run(
-        [*line, f"hydra.run.dir='{folder}'", *overrides], cwd=ROOT, capture_output=True, text=True
-    )
-
-
 @pytest.mark.slow
 def test_the_program_writes_weights_figures_and_a_summary(tmp_path: Path) -> None:
     sizes = ["poses.images=256", "finder.images=256", "poses.batch=32", "finder.batch=32"]
     sizes += ["poses.restart_images=64", "finder.restart_images=32"]
-    done = command(tmp_path, *sizes, "shapes=6", "poses.width=4", "finder.width=8")
+    sizes += ["shapes=6", "poses.width=4", "finder.width=8", f"hydra.run.dir='{tmp_path}'"]
+    done = programs.python("-m", "toftrack.training", "train", *sizes)
     assert done.returncode == 0, done.stderr
     derived = ("detector.pose.onnx", "detector.finder.onnx")
     for name in ("detector.npz", *derived, "images.png", "course.png", "summary.json"):
