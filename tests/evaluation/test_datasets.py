@@ -5,34 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
-from helpers.tracking import Scene
+from helpers.data_sets import PARTS, scene, write, write_icvl, write_msra
 from scipy.io import savemat
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation import datasets
-from toftrack.evaluation.datasets import (
-    DATA_SETS,
-    INTEL_CREATIVE,
-    NYU_CAMERA,
-    open_data_set,
-)
+from toftrack.evaluation.datasets import DATA_SETS, INTEL_CREATIVE, open_data_set
 
 FRAMES = 3
-
-
-PARTS = {"MSRA14": "Subject1", "MSRA15": "P0/TIP", "ICVL": "Testing", "NYU": "test"}
-"""Where the only sequence of a data set lies, and its name, but for ICVL."""
-
-
-def write(name: str, folder: Path, frames: int = FRAMES) -> Scene:
-    """A data set of one sequence; what it shows."""
-    seen = scene(NYU_CAMERA if name == "NYU" else INTEL_CREATIVE, frames)
-    if name.startswith("MSRA"):
-        write_msra(folder / PARTS[name], seen, boxed=name == "MSRA15")
-    else:
-        {"ICVL": write_icvl, "NYU": write_nyu}[name](folder / PARTS[name], seen)
-    return seen
 
 
 def refusal(name: str, folder: Path) -> str:
@@ -47,7 +27,7 @@ def refusal(name: str, folder: Path) -> str:
 
 @pytest.mark.parametrize("name", list(DATA_SETS))
 def test_what_was_written_is_read(name: str, tmp_path: Path) -> None:
-    seen = write(name, tmp_path)
+    seen = write(name, tmp_path, FRAMES)
     data_set, (read,) = open_data_set(name, tmp_path)
     assert read.name == ("test_seq_1" if name == "ICVL" else PARTS[name])
     assert read.side == ("left" if name == "ICVL" else "right")
@@ -64,7 +44,7 @@ def test_what_was_written_is_read(name: str, tmp_path: Path) -> None:
 
 def test_the_folder_of_a_part_or_sequence_will_do(tmp_path: Path) -> None:
     for name, part in PARTS.items():
-        write(name, tmp_path / name)
+        write(name, tmp_path / name, FRAMES)
         assert len(open_data_set(name, tmp_path / name / part)[1]) == 1
 
 
@@ -90,14 +70,14 @@ def test_a_file_of_icvl_may_hold_several_sequences(tmp_path: Path) -> None:
 def test_the_two_persons_of_nyu_are_two_sequences(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(datasets, "_TEST_FRAMES", 3)
     monkeypatch.setattr(datasets, "_FIRST_PERSON", 1)
-    seen = write("NYU", tmp_path)
+    seen = write("NYU", tmp_path, FRAMES)
     _, sequences = open_data_set("NYU", tmp_path)
     assert [(s.name, len(s.images)) for s in sequences] == [("test_1", 1), ("test_2", 2)]
     np.testing.assert_allclose(sequences[1].frame(0), seen.depth_m[1], atol=0.00051)
 
 
 def test_msra14_may_come_without_the_number_of_frames(tmp_path: Path) -> None:
-    write("MSRA14", tmp_path)
+    write("MSRA14", tmp_path, FRAMES)
     labels = tmp_path / "Subject1" / "joint.txt"
     labels.write_text("\n".join(labels.read_text().splitlines()[1:]))
     _, (read,) = open_data_set("MSRA14", tmp_path)
@@ -106,7 +86,7 @@ def test_msra14_may_come_without_the_number_of_frames(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", list(DATA_SETS))
 def test_labels_without_an_image_are_left_out(name: str, tmp_path: Path) -> None:
-    seen = write(name, tmp_path)
+    seen = write(name, tmp_path, FRAMES)
     sorted(path for path in tmp_path.rglob("*") if path.suffix in IMAGES)[1].unlink()
     data_set, (read,) = open_data_set(name, tmp_path)
     assert (len(read.images), read.left_out) == (FRAMES - 1, 1)
@@ -167,7 +147,7 @@ def test_a_box_outside_of_the_image_is_refused(header: tuple[int, ...], tmp_path
 def test_wrong_numbers_of_labels_are_refused(
     name: str, line: int, end: str, reason: str, tmp_path: Path
 ) -> None:
-    write(name, tmp_path)
+    write(name, tmp_path, FRAMES)
     labels = file_of(tmp_path, ".txt")
     lines = labels.read_text().splitlines()
     lines[line] = lines[line].rstrip().rpartition(" ")[0] + end

@@ -7,6 +7,7 @@ import numpy as np
 from helpers.tracking import Scene, sample
 from scipy.io import savemat
 
+from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA
 from toftrack.frames.camera import Camera
 
 THUMB_LAST = [0, *range(5, 21), *range(1, 5)]
@@ -25,6 +26,20 @@ def scene(camera: Camera, frames: int) -> Scene:
         for seen in sample().depth_m[:frames]
     ]
     return Scene(np.array(depth), theirs, sample().joints_m[:frames])
+
+
+PARTS = {"MSRA14": "Subject1", "MSRA15": "P0/TIP", "ICVL": "Testing", "NYU": "test"}
+"""Where the only sequence of a data set lies, and its name, but for ICVL."""
+
+
+def write(name: str, folder: Path, frames: int) -> Scene:
+    """A data set of one sequence; what it shows."""
+    seen = scene(NYU_CAMERA if name == "NYU" else INTEL_CREATIVE, frames)
+    if name.startswith("MSRA"):
+        write_msra(folder / PARTS[name], seen, boxed=name == "MSRA15")
+    else:
+        {"ICVL": write_icvl, "NYU": write_nyu}[name](folder / PARTS[name], seen)
+    return seen
 
 
 def write_msra(folder: Path, seen: Scene, boxed: bool) -> None:

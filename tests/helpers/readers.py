@@ -6,13 +6,14 @@ import zipfile
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
 import numpy as np
 from helpers import bags, videos
-from helpers.data_sets import scene, write_icvl, write_msra, write_nyu
+from helpers.data_sets import write
 from helpers.tracking import ROOT, run
 from hydra.utils import instantiate
 from scipy.io import savemat
@@ -24,7 +25,7 @@ from toftrack.detector.onnx_networks import onnx_file, read_session
 from toftrack.detector.weights import DEFAULT_FILE, checksum, load_weights, save_weights
 from toftrack.devices.replay import Replay, Sample
 from toftrack.errors import ToftrackError
-from toftrack.evaluation.datasets import INTEL_CREATIVE, NYU_CAMERA, open_data_set
+from toftrack.evaluation.datasets import DATA_SETS, open_data_set
 from toftrack.evaluation.image_labels import read_labels
 from toftrack.evaluation.labelling import LabelFile
 from toftrack.frames.camera import Camera
@@ -101,16 +102,6 @@ def read_whole_run(folder: Path) -> None:
     run_there.estimates(len(run_there) - 1)
     run_there.likelihood()
     run_there.segmentation()
-
-
-def read_data_set(name: str) -> Callable[[Path], None]:
-    def read(folder: Path) -> None:
-        _, sequences = open_data_set(name, folder)
-        for sequence in sequences:
-            for image in sequence.images[:_MOST_FRAMES]:
-                sequence.read(image)
-
-    return read
 
 
 def write_readers(folder: Path, whole: bool = True) -> list[Reader]:
@@ -336,17 +327,20 @@ def _runs(folder: Path) -> list[Reader]:
 
 
 def _data_sets(folder: Path) -> list[Reader]:
-    write_msra(folder / "msra14" / "Subject1", scene(INTEL_CREATIVE, 2), boxed=False)
-    write_msra(folder / "msra" / "P0" / "TIP", scene(INTEL_CREATIVE, 2), boxed=True)
-    write_icvl(folder / "icvl" / "Testing", scene(INTEL_CREATIVE, 2))
-    write_nyu(folder / "nyu" / "test", scene(NYU_CAMERA, 2))
     readers = []
-    for name, there in (("MSRA14", "msra14"), ("MSRA15", "msra"), ("ICVL", "icvl"), ("NYU", "nyu")):
-        first = {path.suffix: path for path in sorted((folder / there).rglob("*.*"))}
-        for suffix, file in first.items():
-            reader = read_data_set(name)
-            readers.append(Reader(f"{name}: {suffix}", file, folder / there, reader))
+    for name in DATA_SETS:
+        write(name, there := folder / name, 2)
+        files = {path.suffix: path for path in sorted(there.rglob("*.*"))}
+        reader = partial(_read_data_set, name)
+        readers += [Reader(f"{name}: {suffix}", files[suffix], there, reader) for suffix in files]
     return readers
+
+
+def _read_data_set(name: str, folder: Path) -> None:
+    _, sequences = open_data_set(name, folder)
+    for sequence in sequences:
+        for image in sequence.images[:_MOST_FRAMES]:
+            sequence.read(image)
 
 
 def _bags(folder: Path) -> list[Reader]:
