@@ -2,6 +2,7 @@
 
 import os
 from datetime import timedelta
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -131,16 +132,11 @@ def _follow(tracker: Tracker | HandsTracker, frames: list[tuple[tuple[Any, Any],
             _check(estimate)
 
 
+@pytest.mark.parametrize("kind", [Tracker, partial(HandsTracker, hands=2)])
 @_PATIENT
 @given(frames=_FRAMES)
-def test_one_hand(model: TrackerModel, frames: list[Any]) -> None:
-    _follow(Tracker(model), frames)
-
-
-@_PATIENT
-@given(frames=_FRAMES)
-def test_two_hands(model: TrackerModel, frames: list[Any]) -> None:
-    _follow(HandsTracker(model, hands=2), frames)
+def test_hands(model: TrackerModel, kind: Any, frames: list[Any]) -> None:
+    _follow(kind(model), frames)
 
 
 @pytest.mark.parametrize("hands", [1, 2])
