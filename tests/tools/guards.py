@@ -1,9 +1,8 @@
 #!/usr/bin/env python3
 """Is the tracker as accurate as it was? What CI asks, in less than 90 s.
 
-    python tests/tools/guards.py                      status 1: something is out of bounds
-    python tests/tools/guards.py --seeds 0-19         a row a seed
-    python tests/tools/guards.py --break "K scaled"   with a fault put in, to see who notices it
+    python tests/tools/guards.py                 status 1: something is out of bounds
+    python tests/tools/guards.py --seeds 0-19    a row a seed
 
 Tracks the packaged sample, tests/data/guards (the side told) and tests/data/empty (the side found),
 and compares their means over seeds with BOUNDS: docs/lab/guards.md says where they come from.
@@ -12,14 +11,11 @@ and compares their means over seeds with BOUNDS: docs/lab/guards.md says where t
 import argparse
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
-from unittest.mock import patch
 
 # Before torch is loaded: one thread is the fastest for small images, and leaves the other cores.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -30,10 +26,8 @@ from toftrack.api import make_tracker
 from toftrack.evaluation.measures import Estimates, measured
 from toftrack.evaluation.runs import estimates_of
 from toftrack.evaluation.statistics import mean_of
-from toftrack.hand import shape
 from toftrack.recordings.frame_store import FrameStore
 from toftrack.recordings.store import open_recording, open_source
-from toftrack.tracking import confidence
 from toftrack.tracking.state import TrackerState
 from toftrack.tracking.tracker import Tracker
 
@@ -52,86 +46,33 @@ BOUNDS = {
 leave them, and there is a margin for the floats of other processors: docs/lab/guards.md."""
 
 
-OTHER_SIDE = {"left": "right", "right": "left"}
-
-
-@dataclass(frozen=True)
-class Break:
-    """One fault.  overrides: of the configuration.  patched: entered before the tracker is made,
-    for what no setting can do.  k_scale: times the camera's matrix.  other_side: a wrong one given.
-    """
-
-    overrides: tuple[str, ...] = ()
-    patched: Callable[[], AbstractContextManager[object]] = nullcontext
-    k_scale: float = 1.0
-    other_side: bool = False
-
-
-@contextmanager
-def _turned_index(degrees: float) -> Iterator[None]:
-    """The index finger bends about another axis, turned about the finger's own direction."""
-    rows = list(shape._REST_DEGREES)
-    abduction, elevation, roll = rows[1]
-    rows[1] = (abduction, elevation, roll + degrees)
-    with patch.object(shape, "_REST_DEGREES", tuple(rows)):
-        yield
-
-
-_judge = confidence.JointConfidence.judge
-
-
-def _doubled(
-    model: confidence.JointConfidence, features: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    sigma, near = _judge(model, features)
-    return 2 * sigma, near
-
-
-BREAKS = {
-    # The networks' keypoints neither judge nor pull a pose.
-    "keypoints off": Break(("posterior.keypoints=0", "detector.keypoint_weight=0")),
-    "finger's axis": Break(patched=lambda: _turned_index(5.0)),
-    # All joints' standard deviations twice as large.
-    "sigma doubled": Break(
-        patched=lambda: patch.object(confidence.JointConfidence, "judge", _doubled)
-    ),
-    "other side": Break(other_side=True),
-    "K scaled": Break(k_scale=1.1),
-}
-
-
 def recordings(folder: str) -> dict[str, FrameStore]:
     """Those of tests/data/guards or tests/data/empty, by name."""
     return {path.stem: open_recording(path) for path in sorted((DATA / folder).glob("*.npz"))}
 
 
 @lru_cache
-def _tracker(seed: int, side: str, fault: Break) -> tuple[Tracker, TrackerState]:
+def _tracker(seed: int, side: str) -> tuple[Tracker, TrackerState]:
     """A tracker, which takes seconds to make, and the state that it begins each recording with."""
-    tracker = make_tracker(f"seed={seed}", f"hand.side={side}", *fault.overrides)
+    tracker = make_tracker(f"seed={seed}", f"hand.side={side}")
     return tracker, tracker.state
 
 
-def tracked(recording: FrameStore, seed: int, side: str, name: str | None) -> Estimates:
-    """What the tracker says of all frames of a recording, with a fault of that name in it."""
-    fault = Break() if name is None else BREAKS[name]
-    side = OTHER_SIDE.get(side, side) if fault.other_side else side
-    camera = recording.camera
-    k = camera.K * np.array([[fault.k_scale], [fault.k_scale], [1.0]])
-    with fault.patched():
-        tracker, first = _tracker(seed, side, fault)
-        tracker.state, found = first, []
-        for i, time_s in enumerate(recording.timestamp_s.tolist()):
-            depth_m = camera.rectify(recording.image(i)[0], recording.radial)
-            found.append([tracker.step(depth_m, k, i, time_s)])
+def tracked(recording: FrameStore, seed: int, side: str) -> Estimates:
+    """What the tracker says of all frames of a recording."""
+    camera, (tracker, first) = recording.camera, _tracker(seed, side)
+    tracker.state, found = first, []
+    for i, time_s in enumerate(recording.timestamp_s.tolist()):
+        depth_m = camera.rectify(recording.image(i)[0], recording.radial)
+        found.append([tracker.step(depth_m, camera.K, i, time_s)])
     return estimates_of(found)
 
 
-def sample_figures(seed: int, fault: str | None) -> dict[str, float]:
+def sample_figures(seed: int) -> dict[str, float]:
     """Of the sample: its mean joint error, and the share of frames that are lost."""
     sample = open_source("sample")
     assert sample.truth is not None
-    found = tracked(sample, seed, "right", fault)
+    found = tracked(sample, seed, "right")
     figures = measured(found, sample.truth).first.trust
     return {
         "seed": seed,
@@ -140,13 +81,13 @@ def sample_figures(seed: int, fault: str | None) -> dict[str, float]:
     }
 
 
-def guard_figures(seed: int, fault: str | None) -> dict[str, float]:
+def guard_figures(seed: int) -> dict[str, float]:
     """Of the guards, means over recordings; NaN where nothing could be measured."""
     found = []
     for recording in recordings("guards").values():
         assert recording.truth is not None
         side = str(recording.metadata.get("side", "right"))
-        found.append(measured(tracked(recording, seed, side, fault), recording.truth).first)
+        found.append(measured(tracked(recording, seed, side), recording.truth).first)
     values: dict[str, float | None] = {
         "seed": seed,
         "usable_pct": mean_of([one.trust.usable_pct for one in found]),
@@ -159,9 +100,9 @@ def guard_figures(seed: int, fault: str | None) -> dict[str, float]:
     return {name: np.nan if value is None else value for name, value in values.items()}
 
 
-def empty_figures(seed: int, fault: str | None) -> dict[str, float]:
+def empty_figures(seed: int) -> dict[str, float]:
     """Of rooms, and persons who raise no hand: frames that are called a hand."""
-    found = [tracked(one, seed, "auto", fault) for one in recordings("empty").values()]
+    found = [tracked(one, seed, "auto") for one in recordings("empty").values()]
     return {"called_hand_pct": 100.0 * float(np.mean([(~one.lost).mean() for one in found]))}
 
 
@@ -192,14 +133,13 @@ def _seeds(text: str) -> tuple[int, ...]:
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="Is the tracker as accurate as it was?")
     parser.add_argument("--seeds", type=_seeds, default=SEEDS, help="0-19: these (0-2)")
-    parser.add_argument("--break", dest="fault", choices=BREAKS, help="put a fault in")
     options = parser.parse_args(arguments)
     seeds, processes = options.seeds, min(os.cpu_count() or 1, 8)
     # Each process tracks with one thread, as one process would: the figures are the same.
     with ProcessPoolExecutor(processes, get_context("spawn")) as pool:
-        empty = pool.map(empty_figures, seeds, [options.fault] * len(seeds))
-        guarded = pool.map(guard_figures, seeds, [options.fault] * len(seeds))
-        sampled = pool.map(sample_figures, SEEDS, [options.fault] * len(SEEDS))
+        empty = pool.map(empty_figures, seeds)
+        guarded = pool.map(guard_figures, seeds)
+        sampled = pool.map(sample_figures, SEEDS)
         figures = [one | other for one, other in zip(guarded, empty, strict=True)]
         sample = list(sampled)
     for row in (*sample, *figures):
