@@ -58,12 +58,14 @@ def test_every_change_is_in_the_file_and_the_benchmark_reads_it(tmp_path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["labels.json"]
 
 
-def test_a_file_with_what_json_has_not_is_told_of(tmp_path) -> None:
+def test_what_cannot_be_written_is_told_of(tmp_path) -> None:
+    """In a folder that is not there; and a file with what JSON has not."""
     opened(tmp_path).begin([3])
     path = tmp_path / "labels.json"
     path.write_text(path.read_text().replace('"frames"', '"mine": NaN, "frames"'))
-    with pytest.raises(ToftrackError, match="labels.json' cannot be written .*; give another"):
-        opened(tmp_path).begin([4])
+    for folder in (tmp_path / "gone", tmp_path):
+        with pytest.raises(ToftrackError, match="cannot be written .*; give another --output"):
+            opened(folder).begin([4])
 
 
 def test_a_file_is_continued_with_all_that_is_in_it(tmp_path) -> None:
@@ -139,11 +141,6 @@ def test_what_is_no_point_is_refused(tmp_path, given) -> None:
     with pytest.raises(ValueError):
         labels.set_point(*given)
     assert labels.frames == {"3": {"points": {}}}
-
-
-def test_a_file_that_cannot_be_written_is_one_sentence(tmp_path) -> None:
-    with pytest.raises(ToftrackError, match="cannot be written .*; give another --output"):
-        opened(tmp_path / "gone").begin([1])
 
 
 def test_frames_are_shown_about_the_hand_with_what_the_tracker_says() -> None:

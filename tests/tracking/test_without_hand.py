@@ -2,9 +2,8 @@
 
 import numpy as np
 import pytest
+from helpers.rendered import K
 from helpers.tracking import errors_mm, make_tracker, sample
-
-K = np.array([[200.0, 0, 87.5], [0, 200.0, 71.5], [0, 0, 1]])
 
 
 def wall(distance_m: float) -> np.ndarray:
