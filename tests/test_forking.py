@@ -6,8 +6,7 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 import pytest
@@ -48,23 +47,22 @@ def _follow_anew() -> None:
     _follow(make_tracker(*QUICK))
 
 
+def _ends_well(task: Callable[..., None], *given: object) -> bool:
+    """Whether a forked process does a task and ends; one that does not is ended."""
+    child = multiprocessing.get_context("fork").Process(target=task, args=given)
+    child.start()
+    child.join(_LIMIT_S)
+    child.kill()
+    child.join()
+    return child.exitcode == 0
+
+
 @pytest.mark.parametrize("tracker", ["the same", "another"])
 def test_a_process_forked_after_tracking_tracks_and_ends(tracker: str) -> None:
     with _several_threads():
         used = make_tracker(*QUICK)
         _follow(used)
-        context = multiprocessing.get_context("fork")
-        if tracker == "the same":
-            child = context.Process(target=_follow, args=(used,))
-        else:
-            child = context.Process(target=_follow_anew)
-        child.start()
-        try:
-            child.join(_LIMIT_S)
-            assert child.exitcode == 0
-        finally:
-            child.kill()
-            child.join()
+        assert _ends_well(_follow, used) if tracker == "the same" else _ends_well(_follow_anew)
         _follow(used)
 
 
@@ -81,24 +79,13 @@ def test_a_fork_waits_until_another_thread_has_compiled() -> None:
     thread.start()
     begun.wait(_LIMIT_S)
     threading.Timer(0.1, go_on.set).start()
-    child = os.fork()
-    if child == 0:
-        with compiling.lock:
-            os._exit(7)
+    assert _ends_well(_take_the_lock)
     thread.join()
-    assert _status(child) == 7
 
 
-def _status(child: int) -> int:
-    """How a process ended; one that does not is ended."""
-    deadline = time.monotonic() + _LIMIT_S
-    while time.monotonic() < deadline:
-        ended, status = os.waitpid(child, os.WNOHANG)
-        if ended:
-            return os.waitstatus_to_exitcode(status)
-        time.sleep(0.02)
-    os.kill(child, signal.SIGKILL)
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+def _take_the_lock() -> None:
+    with compiling.lock:
+        pass
 
 
 PROGRAM = """
