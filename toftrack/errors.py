@@ -40,6 +40,14 @@ def check_choice(key: str, value: Any, known: Collection[str], remedy: str = "")
         raise ToftrackError(f"{key}={value} is unknown; give one of {', '.join(known)}{remedy}")
 
 
+def check_version(what: str, version: Any, known: int, remedy: str) -> None:
+    """Raise ToftrackError where a file of ours has another version.  what: "FILE is a camera"."""
+    if version != known:
+        raise ToftrackError(
+            f"{what} of version {version}, and this toftrack reads version {known}; {remedy}"
+        )
+
+
 @contextlib.contextmanager
 def reported_errors(what: str, remedy: str, *kinds: type[Exception]) -> Iterator[None]:
     """Errors of some kinds, by default the system's, become one sentence: what, their words, and

@@ -17,7 +17,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_version, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
 from toftrack.frames.help_text import fields_in_help
@@ -298,11 +298,8 @@ class Camera:
                 f"'{path}' is not a camera file: its format is not '{_FORMAT}'; give a file that "
                 "toftrack wrote"
             )
-        if content.get("version") != _VERSION:
-            raise ToftrackError(
-                f"the camera file '{path}' has version {content.get('version')!r}, but this "
-                f"toftrack reads version {_VERSION}; write it anew"
-            )
+        what = f"'{path}' is a camera file"
+        check_version(what, content.get("version"), _VERSION, "write it anew")
         try:
             needed = {name: content[name] for name in ("K", "width", "height")}
             given = {one.name: content[one.name] for one in fields(cls) if one.name in content}

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_version, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
 
@@ -179,11 +179,8 @@ class HandShape:
             content = read_json(path)
         if not isinstance(content, dict) or content.get("format") != _FORMAT:
             raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
-        if content.get("version") != _VERSION:
-            raise ToftrackError(
-                f"{path} is a hand shape of version {content.get('version')}, and this toftrack"
-                f" reads version {_VERSION}; write it again with this version"
-            )
+        again = "write it again with this version"
+        check_version(f"{path} is a hand shape", content.get("version"), _VERSION, again)
         fitted = content.get("fitted")
         expected = (KeyError, TypeError, ValueError, AttributeError, RuntimeError)
         with reported_errors(f"{path} is a damaged hand shape file", remedy, *expected):

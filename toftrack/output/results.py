@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, check_version, reported_errors
 from toftrack.files.archives import read_archive
 from toftrack.files.json_text import parse_json, read_json
 from toftrack.files.safe_files import write_whole
@@ -312,11 +312,8 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
     whole = known and isinstance(facts.get("joint_names"), list)
     if not whole or not _are_metadata(facts.get("metadata")):
         raise ToftrackError(f"'{path}' does not describe a run; give another folder")
-    if facts.get("version") != _VERSION:
-        raise ToftrackError(
-            f"'{path}' is of version {facts.get('version')}, but this toftrack reads version "
-            f"{_VERSION}; use the toftrack that wrote it"
-        )
+    remedy = "use the toftrack that wrote it"
+    check_version(f"'{path}' describes a run", facts.get("version"), _VERSION, remedy)
     return facts
 
 
