@@ -33,7 +33,7 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_choice, reported_errors
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.camera import Camera
 from toftrack.recordings.images import read_png
@@ -95,8 +95,7 @@ class DataSet:
 def open_data_set(name: str, folder: str | Path) -> tuple[DataSet, list[LabelledSequence]]:
     """A data set by its name, and the sequences that lie in a folder, without the labels whose
     images are missing. Raises ToftrackError: the name is unknown, or the folder lacks it."""
-    if name not in DATA_SETS:
-        raise ToftrackError(f"the data set '{name}' is unknown; known: {', '.join(DATA_SETS)}")
+    check_choice("DATASET", name, DATA_SETS)
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise ToftrackError(f"there is no folder '{folder}'; give the folder of {name}")

@@ -20,7 +20,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError, check_version, reported_errors
+from toftrack.errors import ToftrackError, check_number, check_version, reported_errors
 from toftrack.files.json_text import read_json
 from toftrack.files.safe_files import write_whole
 
@@ -222,11 +222,8 @@ def default_hand_shape(
     hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right", thickness: float = 1.0
 ) -> HandShape:
     """The mean adult hand, scaled to a hand length in metres; float32 on the CPU."""
-    if not 0.08 <= hand_length_m <= 0.30:
-        raise ToftrackError(
-            f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from"
-            " the wrist to the middle fingertip"
-        )
+    remedy = ", in metres from the wrist to the middle fingertip"
+    check_number("hand.length_m", hand_length_m, 0.08, 0.30, remedy=remedy)
     frames = [
         _rotation(abduction, 2) @ _rotation(elevation, 0) @ _rotation(roll, 1)
         for abduction, elevation, roll in _REST_DEGREES
