@@ -6,7 +6,6 @@ X = (u - cx) Z / fx and Y = (v - cy) Z / fy on the undistorted image.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -18,8 +17,7 @@ import cv2
 import numpy as np
 
 from toftrack.errors import ToftrackError, check_version, reported_errors
-from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import read_json, write_json
 from toftrack.frames.help_text import fields_in_help
 
 _FORMAT = "toftrack-camera"
@@ -247,7 +245,7 @@ class Camera:
     def save(self, path: str | Path) -> None:
         """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
         with reported_errors(f"the camera file '{path}' cannot be written", "choose another place"):
-            write_whole(path, json.dumps(self.to_dict(), indent=1) + "\n")
+            write_json(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """The content of a camera file, JSON-able."""

@@ -10,7 +10,6 @@ capitate (Youm et al., J. Bone Joint Surg. 60-A, 1978), which puts the middle fi
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -21,8 +20,7 @@ import torch
 from torch import Tensor
 
 from toftrack.errors import ToftrackError, check_number, check_version, reported_errors
-from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import read_json, write_json
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190
@@ -169,7 +167,7 @@ class HandShape:
             **{name: getattr(self, name).tolist() for name in _TENSORS},
             "fitted": self.fitted and self.fitted.content(),
         }
-        write_whole(path, json.dumps(content, indent=1) + "\n")
+        write_json(path, content)
 
     @staticmethod
     def load(path: str | Path) -> HandShape:

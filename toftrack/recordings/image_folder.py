@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import re
 import stat
@@ -18,8 +17,8 @@ import numpy as np
 
 from toftrack.errors import ToftrackError, check_number, reported_errors
 from toftrack.files.archives import MOST_TEXT_BYTES, broken_is_value_error
-from toftrack.files.json_text import parse_json
-from toftrack.files.safe_files import open_new, open_to_read, write_whole
+from toftrack.files.json_text import parse_json, write_json
+from toftrack.files.safe_files import open_new, open_to_read
 from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import (
     MILLIMETRE,
@@ -291,7 +290,7 @@ def write_image_folder(
                 f"the folder '{folder}' has images, {_CAMERA} or {_TIMES} already; choose an empty "
                 "one"
             )
-        write_whole(folder / _CAMERA, json.dumps(content, indent=1) + "\n")
+        write_json(folder / _CAMERA, content)
         with io.TextIOWrapper(open_new(folder / _TIMES), encoding="utf-8") as times:
             for number, time_s in enumerate(store.timestamp_s):
                 depth_m, amplitude = store.image(number)
