@@ -25,7 +25,7 @@ import yaml
 from toftrack.errors import ToftrackError, one_line, reported_errors
 from toftrack.evaluation.statistics import text_of
 from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import open_to_read, write_whole
+from toftrack.files.safe_files import natural_order, open_to_read, write_whole
 from toftrack.programs.command_line import plain_parser
 from toftrack.views.figures import chart
 
@@ -85,10 +85,8 @@ def read_runs(folder: str | Path) -> list[Run]:
             " sweep, multirun/DATE/TIME"
         )
 
-    def natural(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in path.parts]
-
-    return [_read_run(path, folder) for path in sorted(found, key=natural)]
+    found.sort(key=lambda path: natural_order(path.as_posix()))
+    return [_read_run(path, folder) for path in found]
 
 
 def _read_run(path: Path, folder: Path) -> Run:
@@ -216,9 +214,10 @@ def _table(groups: Sequence[Group], figure: str) -> str:
     lines = [f" #  runs failed  {column:>{wide}}   spread    ms/frame  settings"]
     for number, group in enumerate(groups, 1):
         failed = sum(run.error is not None for run in group.runs)
+        error, spread = text_of(group.error, digits), text_of(group.spread, digits)
         lines.append(
-            f"{number:2d} {len(group.runs):5d} {failed:6d}  {text_of(group.error, digits):>{wide}}"
-            f" {text_of(group.spread, digits):>8}  {text_of(group.cost_ms, 1):>10}  {group.settings}"
+            f"{number:2d} {len(group.runs):5d} {failed:6d}  {error:>{wide}} {spread:>8}"
+            f"  {text_of(group.cost_ms, 1):>10}  {group.settings}"
         )
     names = list(dict.fromkeys(name for group in groups for name in group.recordings))
     if len(names) > 1:
