@@ -40,11 +40,16 @@ def check_choice(key: str, value: Any, known: Collection[str], remedy: str = "")
         raise ToftrackError(f"{key}={value} is unknown; give one of {', '.join(known)}{remedy}")
 
 
-def check_version(what: str, version: Any, known: int, remedy: str) -> None:
-    """Raise ToftrackError where a file of ours has another version.  what: "FILE is a camera"."""
-    if version != known:
+def check_format(path: Any, content: Any, form: str, version: int, kind: str, remedy: str) -> None:
+    """Raise ToftrackError unless the content of a file, "a camera file", is of that format of ours,
+    and of that version.
+    """
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ToftrackError(f"'{path}' is not {kind}: its format is not '{form}'; {remedy}")
+    if (found := content.get("version")) != version:
         raise ToftrackError(
-            f"{what} of version {version}, and this toftrack reads version {known}; {remedy}"
+            f"'{path}' is {kind} of version {found}, and this toftrack reads version {version}; "
+            f"{remedy}"
         )
 
 

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError, check_number, check_version, reported_errors
+from toftrack.errors import ToftrackError, check_format, check_number, reported_errors
 from toftrack.files.json_text import read_json, write_json
 
 SIDES = ("right", "left")
@@ -175,10 +175,7 @@ class HandShape:
         remedy = "give hand.shape=default or a file of a hand's shape"
         with reported_errors(f"{path} cannot be read", remedy, OSError, ValueError):
             content = read_json(path)
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
-        again = "write it again with this version"
-        check_version(f"{path} is a hand shape", content.get("version"), _VERSION, again)
+        check_format(path, content, _FORMAT, _VERSION, "a hand shape file", remedy)
         fitted = content.get("fitted")
         expected = (KeyError, TypeError, ValueError, AttributeError, RuntimeError)
         with reported_errors(f"{path} is a damaged hand shape file", remedy, *expected):

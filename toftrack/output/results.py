@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.errors import MOST_HANDS, ToftrackError, check_version, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, check_format, reported_errors
 from toftrack.files.archives import read_archive
 from toftrack.files.json_text import parse_json, read_json, write_json
 from toftrack.frames.estimate import Estimate
@@ -307,12 +307,10 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
                 "that `toftrack track` wrote, such as outputs/DATE/TIME"
             )
         facts = read_json(path)
-    known = isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
-    whole = known and isinstance(facts.get("joint_names"), list)
-    if not whole or not _are_metadata(facts.get("metadata")):
+    remedy = "give another folder, or use the toftrack that wrote it"
+    check_format(path, facts, RUN_FORMAT, _VERSION, "the description of a run", remedy)
+    if not isinstance(facts.get("joint_names"), list) or not _are_metadata(facts.get("metadata")):
         raise ToftrackError(f"'{path}' does not describe a run; give another folder")
-    remedy = "use the toftrack that wrote it"
-    check_version(f"'{path}' describes a run", facts.get("version"), _VERSION, remedy)
     return facts
 
 

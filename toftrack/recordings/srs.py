@@ -26,7 +26,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from toftrack.errors import ToftrackError, check_version, reported_errors
+from toftrack.errors import ToftrackError, reported_errors
 from toftrack.files.json_text import parse_json
 from toftrack.files.safe_files import open_to_read
 from toftrack.frames.camera import Camera
@@ -233,8 +233,11 @@ class SrsRecording(FrameStore):
                 f"'{self.path}' is empty or not an .srs stream file: it does not begin with 'srIO';"
                 " give a recording as the vendor's or toftrack's recorder writes it"
             )
-        remedy = "convert it with the vendor's tools"
-        check_version(f"'{self.path}' is a stream file", version, _VERSION, remedy)
+        if version != _VERSION:
+            raise ToftrackError(
+                f"the stream file '{self.path}' has version {version}, but this toftrack reads "
+                f"version {_VERSION}; convert it with the vendor's tools"
+            )
         position, stamp = _PAIR.size, np.nan
         while position < size and self.damage is None:
             base = stream.read(_PAIR.size)
