@@ -178,9 +178,11 @@ def test_an_estimate_changed_in_place_does_not_change_the_next_one() -> None:
     assert lost.lost and np.array_equal(lost.joints_m, found), "the last one stands"
 
 
-def test_a_configuration_of_one_s_own(tmp_path: Path) -> None:
+def test_a_configuration_of_one_s_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "config.yaml").write_text("seed: 5\n")
-    assert configuration("seed=6", config_dir=tmp_path) == {"seed": 6}
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path, ""):
+        assert configuration("seed=6", config_dir=folder) == {"seed": 6}
     with pytest.raises(toftrack.ToftrackError, match="no config.yaml in the folder"):
         toftrack.make_tracker(config_dir=tmp_path / "gone")
 

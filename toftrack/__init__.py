@@ -73,7 +73,7 @@ _MODULES = {
     "tracking.tracker": "HandsTracker Tracker",
     "views.overlay": "draw",
 }
-_PLACES = {name: f"toftrack.{place}" for place, it in _MODULES.items() for name in it.split()}
+_PLACES = {name: f"toftrack.{at}" for at, names in _MODULES.items() for name in names.split()}
 
 if not TYPE_CHECKING:  # checkers would take any name for one of ours, and find none in `import *`
     __all__ = sorted((*_PLACES, "__version__"))

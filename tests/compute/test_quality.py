@@ -33,7 +33,7 @@ def levels(pace: Pace, took_s: Iterable[float]) -> list[int]:
 
 
 @pytest.fixture
-def ask(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], float]], None]:
+def set_clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], float]], None]:
     """Give Timekeepers another clock."""
     return lambda clock: monkeypatch.setattr(quality, "time", SimpleNamespace(perf_counter=clock))
 
@@ -86,9 +86,9 @@ def test_a_budget_that_is_none_is_refused(budget_ms: object) -> None:
         pace_within(budget_ms)  # type: ignore[arg-type]
 
 
-def test_what_is_done_after_the_step_counts_and_waiting_does_not(ask) -> None:
+def test_what_is_done_after_the_step_counts_and_waiting_does_not(set_clock) -> None:
     now = [0.0]
-    ask(lambda: now[0])
+    set_clock(lambda: now[0])
     time = Timekeeper(Pace(BUDGET_S))
     for _ in range(30):
         time.begin()
@@ -101,8 +101,8 @@ def test_what_is_done_after_the_step_counts_and_waiting_does_not(ask) -> None:
     assert 0 < time.reduced < 30
 
 
-def test_a_frame_is_timed_from_when_its_raw_image_was_there(ask) -> None:
-    ask(lambda: 50.0)
+def test_a_frame_is_timed_from_when_its_raw_image_was_there(set_clock) -> None:
+    set_clock(lambda: 50.0)
     time = Timekeeper(Pace())
     time.begin(began_s=49.5)
     assert time.took_s() == pytest.approx(0.5)
@@ -130,11 +130,11 @@ def test_less_quality_may_be_one_thread() -> None:
         assert threads() == many
 
 
-def test_a_recording_is_tracked_alike_however_slow_the_machine_is(ask) -> None:
+def test_a_recording_is_tracked_alike_however_slow_the_machine_is(set_clock) -> None:
     scene, found = sample(), []
     for step_s in (0.001, 3.0):
         usual = make_tracker("hand.side=right")
-        ask(slow(step_s))
+        set_clock(slow(step_s))
         tracker = Tracker(usual.model)
         estimates = [tracker.step(scene.depth_m[i], scene.k, i, i / 25) for i in range(5)]
         assert tracker.time.reduced == 0
@@ -144,9 +144,9 @@ def test_a_recording_is_tracked_alike_however_slow_the_machine_is(ask) -> None:
 
 
 @pytest.mark.parametrize("hands", [1, 2])
-def test_a_slow_machine_still_tracks_with_less_quality(hands: int, ask) -> None:
+def test_a_slow_machine_still_tracks_with_less_quality(hands: int, set_clock) -> None:
     usual = build_hands_tracker(configuration(f"hands={hands}", "tracker.budget_ms=33"))
-    ask(slow(0.06))
+    set_clock(slow(0.06))
     scene = sample()
     for i in range(12):
         first, *_ = usual.step(scene.depth_m[i], scene.k, i, i / 25)

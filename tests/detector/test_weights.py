@@ -105,7 +105,7 @@ def test_a_damaged_byte_anywhere_is_an_error_of_ours_or_harmless(file: Path) -> 
     [
         ({"version": 2}, "weights of version 2, and this toftrack reads version 1"),
         ({"format": "toftrack-pose-space"}, "is not a file of the detector's weights"),
-        *(({"pose_width": width}, "of another network") for width in (6, 0, 10**6, "24", True)),
+        *(({"pose_width": width}, "another network; give") for width in (6, 0, 10**6, "24", True)),
     ],
 )
 def test_weights_that_say_that_they_are_others_are_refused(

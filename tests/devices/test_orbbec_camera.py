@@ -129,6 +129,8 @@ def test_one_of_several_cameras_is_chosen_by_its_serial(plug: Plug) -> None:
     assert orbbec(serial="CL77").description["serial"] == "CL77"
     with pytest.raises(ToftrackError, match="serial number 5; .* 0042, CL77"):
         orbbec(serial=5)
+    plug(a_camera("CL77"), a_camera("CL77"))  # listed twice
+    assert orbbec(serial="CL77").description["serial"] == "CL77"
 
 
 def test_a_size_that_the_camera_lacks_is_reported_with_those_it_has(

@@ -259,7 +259,6 @@ def test_a_slow_consumer_gets_the_newest_frame_and_the_rest_is_counted() -> None
             while device.counts.received < min(seen + 3, 100):
                 time.sleep(0.001)
     indices = [frame.index for frame in frames]
-    assert indices[0] == 0
     assert indices[-1] == 99
     assert indices == sorted(set(indices))
     assert len(indices) < 60

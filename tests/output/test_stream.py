@@ -218,7 +218,7 @@ def test_the_fields_that_the_configuration_advises_fit_into_one_ethernet_frame()
         (["stream=udp", "stream.port=0"], "stream.port=0"),
         (["stream=udp", "stream.host=" + "a" * 70], "stream.host=aaa"),
         (["stream=udp", "stream.fields=[joints]"], "stream.fields=joints is unknown"),
-        (["stream=stdout", "stream.fields=[]"], "stream.fields=[] is unknown"),
+        (["stream=stdout", "stream.fields=[]"], "stream.fields is empty"),
         (["stream=stdout", "stream.waiting=0"], "stream.waiting=0"),
     ],
 )

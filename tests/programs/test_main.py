@@ -134,7 +134,13 @@ def test_settings_and_options_are_no_files(words: list[str], tmp_path, monkeypat
     assert with_recording(words) == words
 
 
-@pytest.mark.parametrize("words", ["a.npz -m seed=1,2 view=none", "-m seed=1,2 view=none a.npz"])
+@pytest.mark.parametrize(
+    "words",
+    [
+        *("a.npz -m seed=1,2 view=none", "-m seed=1,2 view=none a.npz"),
+        "-m -- seed=1,2 view=none a.npz",
+    ],
+)
 def test_a_sweep_of_a_recording_may_be_written_in_any_order(words: str) -> None:
     *overrides, option = options_last(with_recording(words.split()))
     assert option == "-m"

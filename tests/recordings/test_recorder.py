@@ -300,7 +300,7 @@ def test_without_a_frame_there_is_no_file(tmp_path: Path) -> None:
 
 
 def test_frames_that_wait_while_python_ends_are_recorded(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "hand.npz", Images(), 1.0) as recorder:
+    with closing(Recorder(tmp_path / "hand.npz", Images(), 1.0)) as recorder:
         recorder._second.shutdown()  # as Python does at its end
         recorder.put(one_frame(), wait=True)
     assert recorder.ended is None and recorder.frames == 1

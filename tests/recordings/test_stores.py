@@ -133,3 +133,11 @@ def test_whatever_is_damaged_or_cut_off_it_is_read_or_reported(path: Path) -> No
 def test_what_is_not_there_is_reported(tmp_path: Path, name: str) -> None:
     with pytest.raises(ToftrackError, match=f"there is no (file|bag) .*{name}'; give the path"):
         opened(tmp_path / name)
+
+
+def test_a_store_of_somebody_elses_may_call_that_of_its_base() -> None:
+    class Other(FrameStore):
+        def __init__(self) -> None:
+            super().__init__()
+
+    assert Other().names == ()

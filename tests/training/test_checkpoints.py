@@ -29,8 +29,9 @@ def test_a_checkpoint_of_another_training_is_refused(tmp_path: Path) -> None:
         resumed.restore("poses", wrong, {"batch": 24})
     for content in (b"PK no archive", pickle.dumps({"settings": Path()}), b""):
         path.write_bytes(content)
-        with pytest.raises(ToftrackError, match="is no checkpoint"):
+        with pytest.raises(ToftrackError, match="is no checkpoint") as refused:
             resumed.restore("poses", progress, {})
+        assert "weights_only" not in str(refused.value)  # torch's advice to trust the file
     with pytest.raises(ToftrackError, match="there is no checkpoint"):
         Checkpoints(tmp_path, 1.0, resume=tmp_path / "gone").restore("poses", progress, {})
 

@@ -120,7 +120,7 @@ def compose_rows(reference, tangent, pivot, out):
 
 @entry_point
 def redraw_rows(particles, weights, positions, tangents, lower, upper, folds, pivot, out):
-    """See rigid.redraw_with; particles, tangents, out: (n, 6 + d), bounds: (d,), float32.
+    """See rigid.redraw; particles, tangents, out: (n, 6 + d), bounds: (d,), float32.
 
     weights: (M,), positions: (n,), pivot: (3,) float64.  folds: outside of the bounds, coordinates
     are folded back instead of truncated.
@@ -285,7 +285,7 @@ def redraw(
     upper: Tensor,
     mode: str,
 ) -> Tensor:
-    """See rigid.redraw_with; on the CPU, in float32."""
+    """See rigid.redraw; on the CPU, in float32."""
     moves, shares = _rows(tangents), weights.double().numpy()
     out, ends = np.empty(moves.shape, np.float32), (_rows(lower), _rows(upper))
     given = _rows(particles), shares, positions.numpy(), moves, *ends, mode == "reflect"

@@ -48,7 +48,8 @@ def configuration(*overrides: str, config_dir: str | Path | None = None) -> Dict
 
     Raises ToftrackError when it cannot be composed.
     """
-    folder = Path(config_dir or configuration_folder()).expanduser().resolve()
+    given = configuration_folder() if config_dir is None else Path(config_dir)
+    folder = given.expanduser().resolve()
     if not (folder / _ROOT).is_file():
         if any(folder.glob("*/*.yaml")):
             return configuration(searched(folder), *overrides)

@@ -134,10 +134,11 @@ def read_session(file: Path, weights: Path) -> Any:
 
     Raises ToftrackError for one that is damaged.
     """
-    if not file.exists():
-        return None
-    with reported_errors(f"{file} cannot be read", _anew(weights)), open_to_read(file) as stream:
-        content = stream.read(_LARGEST_BYTES + 1)
+    with reported_errors(f"{file} cannot be read", _anew(weights)):
+        if not file.exists():
+            return None
+        with open_to_read(file) as stream:
+            content = stream.read(_LARGEST_BYTES + 1)
     if len(content) > _LARGEST_BYTES or content[-DIGEST:] != digest(content[:-DIGEST]):
         raise ToftrackError(f"{file} is damaged, its checksum is wrong; {_anew(weights)}")
     # ONNX Runtime's errors have no class of their own.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Collection
-from contextlib import AbstractContextManager
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,10 +93,15 @@ def weights_file(path: str | Path | None = None) -> Path:
     return DEFAULT_FILE if path is None else Path(path)
 
 
-def _other_networks_refused(path: Path) -> AbstractContextManager[None]:
-    """Within, what does not fit the networks is a ToftrackError about the file."""
-    kinds = (LookupError, TypeError, ValueError, RuntimeError)
-    return reported_errors(f"{path} holds weights of another network", _AGAIN, *kinds)
+@contextmanager
+def _other_networks_refused(path: Path) -> Iterator[None]:
+    """Within, what does not fit the networks is a ToftrackError about the file, without torch's
+    list of all that does not fit.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, RuntimeError):
+        raise ToftrackError(f"{path} holds weights of another network; {_AGAIN}") from None
 
 
 def _width(metadata: dict[str, Any], name: str) -> int:

@@ -62,9 +62,9 @@ def chosen_serial(
             + otherwise
         )
     # A number on the command line loses its zeros.
-    meant = [n for n in numbers if serial is None or n.lstrip("0") == str(serial).lstrip("0")]
+    meant = {n for n in numbers if serial is None or n.lstrip("0") == str(serial).lstrip("0")}
     if len(meant) == 1:
-        return meant[0]
+        return meant.pop()
     those = "" if serial is None else f" with the serial number {serial}"
     raise ToftrackError(
         f"there are {len(meant)} {maker} cameras{those}; set device.serial to one of {listed}"

@@ -332,6 +332,6 @@ class Camera:
         if image.shape != (self.height, self.width):
             size = "x".join(map(str, image.shape[::-1]))
             raise ToftrackError(
-                f"{what} has {size} pixels, but its camera {self.width}x{self.height}, in "
-                f"{self.height} rows; give the camera that took the images (camera.file=FILE)"
+                f"{what} has {size} pixels, but its camera {self.width}x{self.height} (columns x "
+                "rows); give the camera that took the images (camera.file=FILE)"
             )

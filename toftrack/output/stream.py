@@ -198,6 +198,9 @@ def known_fields(fields: Sequence[str] | None) -> tuple[str, ...]:
         return LINE_FIELDS
     one = isinstance(fields, str) or not isinstance(fields, Sequence)
     names: tuple[Any, ...] = (fields,) if one else tuple(fields)
-    for name in names or (fields,):
+    if not names:
+        some = ", ".join(LINE_FIELDS)
+        raise ToftrackError(f"stream.fields is empty; give some of {some}, or null for all")
+    for name in names:
         check_choice("stream.fields", name, LINE_FIELDS, ", or null for all")
     return names

@@ -176,6 +176,8 @@ def options_last(arguments: Sequence[str]) -> list[str]:
     options: list[str] = []
     overrides: list[str] = []
     for word, is_value in _words(arguments):
+        if word == "--":
+            continue  # what it parts comes in the other order
         if is_value:
             options.append(word)
         elif word.startswith("-"):

@@ -22,7 +22,7 @@ def main(arguments: Sequence[str]) -> None:
         "accuracy": _accuracy,
         "ablation": _ablation,
     }
-    first = next(iter(arguments), "-")
+    first = arguments[0] if arguments else "speed"
     if first in ("-h", "--help"):
         print(
             "usage: toftrack benchmark [speed] ...       time of hypotheses and frames\n"

@@ -44,8 +44,8 @@ def main(arguments: Sequence[str]) -> None:
     add("--camera", help="camera file instead of the recording's own camera")
     about = "MHz of the SR3000: gives the range of a .srs, of IN (if it states none) or of OUT"
     add("--modulation", type=int, default=DEFAULT_MODULATION_MHZ, help=about)
-    about = "metres of one step of the PNG images to write"
-    parser.add_number("--unit", 0, 0.99, help=about)
+    metres, about = " metres", "metres of one step of the PNG images to write"
+    parser.add_number("--unit", 0, 0.99, remedy=metres, help=about)
     add("--overwrite", action="store_true", help="replace an existing file")
     add("--topic", help="topic of the depth images in a ROS bag that has several")
     names = ("FX", "FY", "CX", "CY")

@@ -19,7 +19,7 @@ from toftrack.frames.frame import Truth
 DEFAULT_FPS = 25.0
 
 
-@dataclass(eq=False, repr=False, kw_only=True)
+@dataclass(init=False, eq=False, repr=False, kw_only=True)
 class FrameStore:
     """T frames in an order, each to be had by its number. Opening one raises ToftrackError, one
     sentence that names the file: it is missing, damaged or of another kind, or nothing tells its

@@ -265,7 +265,7 @@ def _times(arrays: dict[str, Any], count: int, given: float | None) -> tuple[np.
         rate = arrays["fps"]
         fps = float(rate.reshape(())) if rate.size == 1 and rate.dtype.kind in "iuf" else 0.0
         if not 0 < fps < np.inf:
-            raise ToftrackError(f"'fps' must be one positive number, but is {rate}")
+            raise ToftrackError(f"'fps' must be one positive number, but is {str(rate):.40}")
     if "timestamp_s" not in arrays:
         fps = fps or given or DEFAULT_FPS
         return np.arange(count) / fps, fps

@@ -49,7 +49,8 @@ def decode_frame(
     data: bytes, range_m: float, amplitude_threshold: int = 0
 ) -> tuple[np.ndarray, np.ndarray]:
     """The images of a raw frame, new arrays: (144, 176) float32 metres along each pixel's ray, 0 =
-    no reading, as of pixels below the threshold, and the (144, 176) uint16 amplitude.
+    no reading, as of pixels whose amplitude is below the threshold, and the (144, 176) uint16
+    amplitude.  range_m: what the largest distance word stands for.
     """
     words = np.frombuffer(data, _WORD).reshape(2, HEIGHT, WIDTH)
     radial = words[0].astype(np.float32) * np.float32(range_m / _LARGEST_WORD)
@@ -60,8 +61,9 @@ def decode_frame(
 
 
 def encode_frame(radial_m: np.ndarray, amplitude: np.ndarray | None, range_m: float) -> bytes:
-    """The raw frame of two images; `decode_frame` gives them back, distances to range_m / 131070.
+    """The raw frame of two images as `decode_frame` gives them back, distances to range_m / 131070.
     What is no number or beyond the range becomes "no reading"; no amplitude gives zeros.
+    ToftrackError where an image is not of the camera's size.
     """
     for image in (radial_m, amplitude):
         if image is not None and image.shape != (HEIGHT, WIDTH):

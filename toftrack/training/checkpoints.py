@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import torch
@@ -89,7 +90,10 @@ class Checkpoints:
         what = f"{path} is no checkpoint of a training of the detector"
         with reported_errors(what, "train without resume", Exception):  # reading may raise any
             with open_to_read(path) as stream:
-                content = torch.load(stream, map_location="cpu", weights_only=True)
+                try:
+                    content = torch.load(stream, map_location="cpu", weights_only=True)
+                except UnpicklingError:  # whose words advise to let the file run what it likes
+                    raise ValueError("it is damaged, or holds more than numbers") from None
             before = content["settings"]
             for key, value in settings.items():
                 if before[key] != value:

@@ -22,7 +22,7 @@ _STEPS, _BUNDLE_STEPS = 48, 16
 TILE = 4
 MIDDLE, CORNER = np.float32(1.5), np.float32(2.13)
 """Of a tile, pixels: its side, middle, and how far a corner is from that."""
-_NEAR_M, _NONE = np.float32(0.0004), np.float32(0)
+_NEAR_M = np.float32(0.0004)
 
 
 @compiled
@@ -88,8 +88,8 @@ def draw_part(part, label, lens, depth, labels):
         return
     f = lens[0]
     square = r * r
-    left, right = seen_between(x0, z0, square, _NONE, square, f, lens[1], int(lens[3]))
-    top, bottom = seen_between(y0, z0, square, _NONE, square, f, lens[2], int(lens[4]))
+    left, right = seen_between(x0, z0, square, np.float32(0), square, f, lens[1], int(lens[3]))
+    top, bottom = seen_between(y0, z0, square, np.float32(0), square, f, lens[2], int(lens[4]))
     apart = CORNER / f
     for v0 in range(top, bottom + 1, TILE):
         for u0 in range(left, right + 1, TILE):

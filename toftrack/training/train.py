@@ -89,7 +89,6 @@ def train(config: DictConfig) -> float:
     save_weights(path, pose_network, finder_network, about)
     summary = about | {"poses": pose_course, "finder": finder_course}
     write_json(folder / "summary.json", summary)
-    derived = [] if missing else [file.name for file in export_networks(path)]
     error_mm, learned, pictures = math.nan, "", ["images.png"]
     if pose_course:
         write_picture(folder / "course.png", course_figure(pose_course))
@@ -100,6 +99,7 @@ def train(config: DictConfig) -> float:
             f"; on the last training images: joints {error_mm:.1f} mm by keypoints,"
             f" {last['joints_mm']:.1f} mm by the likeliest hypothesis"
         )
+    derived = [] if missing else [file.name for file in export_networks(path)]
     print(f"trained in {minutes} minutes{learned}")
     for name in (config.output, *derived, *pictures, "summary.json"):
         print(f"  {folder / name}")

@@ -68,11 +68,14 @@ def in_radians(path: str | Path, angles: np.ndarray, units: str | None, say: str
         raise ToftrackError(f"{path} {what}; {say.format('degrees or radians')}")
     largest = float(np.nan_to_num(np.abs(angles)).max())
     # No joint bends by more than 2.1 rad, and no collection of hands stays within 2.1 degrees.
-    if largest > 4.0 if units == "radians" else 0 < largest < 3.0:
-        other = "degrees" if units == "radians" else "radians"
+    if units == "radians":
+        wrong, size, other = largest > 4.0, "large", "degrees"
+    else:
+        wrong, size, other = 0 < largest < 3.0, "small", "radians"
+    if wrong:
         raise ToftrackError(
-            f"{path} has angles up to {largest:.2f}, which cannot be a hand's {units}; if they are"
-            f" {other}, {say.format(other)}"
+            f"{path} has angles up to {largest:.3g}, too {size} for {units}; if they are {other}, "
+            f"{say.format(other)}"
         )
     return np.radians(angles) if units == "degrees" else angles
 
