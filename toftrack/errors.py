@@ -40,6 +40,19 @@ def check_choice(key: str, value: Any, known: Collection[str], remedy: str = "")
         raise ToftrackError(f"{key}={value} is unknown; give one of {', '.join(known)}{remedy}")
 
 
+def check_format(path: Any, content: Any, form: str, version: int, kind: str, remedy: str) -> None:
+    """Raise ToftrackError unless the content of a file, "a camera file", is of that format of ours,
+    and of that version.
+    """
+    if not isinstance(content, dict) or content.get("format") != form:
+        raise ToftrackError(f"'{path}' is not {kind}: its format is not '{form}'; {remedy}")
+    if (found := content.get("version")) != version:
+        raise ToftrackError(
+            f"'{path}' is {kind} of version {found}, and this toftrack reads version {version}; "
+            f"{remedy}"
+        )
+
+
 @contextlib.contextmanager
 def reported_errors(what: str, remedy: str, *kinds: type[Exception]) -> Iterator[None]:
     """Errors of some kinds, by default the system's, become one sentence: what, their words, and

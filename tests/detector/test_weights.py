@@ -103,8 +103,8 @@ def test_a_damaged_byte_anywhere_is_an_error_of_ours_or_harmless(file: Path) -> 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"version": 2}, "holds weights of version 2, and this toftrack reads version 1"),
-        ({"format": "toftrack-pose-space"}, "is no file of the detector's weights"),
+        ({"version": 2}, "weights of version 2, and this toftrack reads version 1"),
+        ({"format": "toftrack-pose-space"}, "is not a file of the detector's weights"),
         *(({"pose_width": width}, "another network; give") for width in (6, 0, 10**6, "24", True)),
     ],
 )

@@ -362,7 +362,7 @@ def test_camera_file_replaces_the_optics(tmp_path: Any) -> None:
 @pytest.mark.parametrize(
     ("make", "words"),
     [
-        (lambda: sr3000("ethernet"), "usb, libmesasr or emulated"),
+        (lambda: sr3000("ethernet"), "usb, libmesasr, emulated"),
         (lambda: sr3000("emulated", modulation_mhz=25), "40, 30, 21, 20, 19"),
         (lambda: sr3000("emulated", integration_time=256), "at least 0 and at most 255"),
         (lambda: usb_settings(ids=("1ad2",)), "VENDOR:PRODUCT"),

@@ -53,7 +53,7 @@ def test_sequences_and_frames_can_be_chosen_and_labels_without_image_are_told(
 @pytest.mark.parametrize(
     ("arguments", "reason"),
     [
-        (["MSRA", "."], "known: MSRA14, MSRA15, ICVL, NYU"),
+        (["MSRA", "."], "one of MSRA14, MSRA15, ICVL, NYU"),
         (["MSRA15", ".", "--sequences", "P9/1"], "--sequences=P9/1 is unknown; give one of P0/1"),
         (["MSRA15", ".", "nonsense=1"], "nonsense"),
         (["MSRA15", ".", "--frames", "1", "--json", "no/such/file"], "cannot be written"),

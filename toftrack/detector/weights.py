@@ -16,7 +16,7 @@ from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from toftrack.detector.network import Finder, PoseNet
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_format, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
 
@@ -144,13 +144,7 @@ def _read(
             raise ToftrackError(f"{path} is too large for weights of the detector; {_AGAIN}")
         arrays = read_archive(path, names)
         metadata = parse_json(str(arrays.pop("metadata")))
-        if not isinstance(metadata, dict) or metadata.get("format") != FORMAT:
-            raise ValueError(f"its metadata do not say {FORMAT}")
-    if metadata.get("version") != VERSION:
-        raise ToftrackError(
-            f"{path} holds weights of version {metadata.get('version')}, and this toftrack reads"
-            f" version {VERSION}; {_AGAIN}"
-        )
+    check_format(path, metadata, FORMAT, VERSION, "a file of the detector's weights", _AGAIN)
     return arrays, metadata
 
 

@@ -83,11 +83,7 @@ def frames_of(device: BaseDevice) -> Iterator[Frame]:
         yield frame
 
 
-def check_keep(keep: str) -> None:
-    """ToftrackError for what a live camera cannot do with the frames that wait."""
-    if keep not in ("newest", "every"):
-        raise ToftrackError(f"device.keep={keep} is unknown; give newest or every")
-
-
 Device = BaseDevice
 """What whoever takes one calls it."""
+KEEP = ("newest", "every")
+"""What a live camera can do with the frames that wait."""

@@ -9,9 +9,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from toftrack.devices.base import BaseDevice, check_keep
+from toftrack.devices.base import KEEP, BaseDevice
 from toftrack.devices.seen import cameras_seen
-from toftrack.errors import ToftrackError, check_number, reported_errors
+from toftrack.errors import ToftrackError, check_choice, check_number, reported_errors
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 
@@ -125,7 +125,7 @@ class SdkCamera(BaseDevice):
         timeout_s: float,
     ) -> None:
         """Check the settings that all such cameras have; raises ToftrackError."""
-        check_keep(keep)
+        check_choice("device.keep", keep, KEEP)
         check_number("device.queue_frames", queue_frames, 2, whole=True)
         check_number("device.timeout_s", timeout_s, 0, above=True)
         check_number("device.start", start, 0, whole=True)

@@ -25,7 +25,6 @@ are compared, and the two ends of the wrist as their middle; the palm's middle h
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -33,8 +32,8 @@ from pathlib import Path
 
 import numpy as np
 
-from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.safe_files import open_to_read
+from toftrack.errors import ToftrackError, check_choice, reported_errors
+from toftrack.files.safe_files import natural_order, open_to_read
 from toftrack.frames.camera import Camera
 from toftrack.recordings.images import read_png
 from toftrack.recordings.matlab import read_matlab
@@ -95,8 +94,7 @@ class DataSet:
 def open_data_set(name: str, folder: str | Path) -> tuple[DataSet, list[LabelledSequence]]:
     """A data set by its name, and the sequences that lie in a folder, without the labels whose
     images are missing. Raises ToftrackError: the name is unknown, or the folder lacks it."""
-    if name not in DATA_SETS:
-        raise ToftrackError(f"the data set '{name}' is unknown; known: {', '.join(DATA_SETS)}")
+    check_choice("DATASET", name, DATA_SETS)
     folder = Path(folder).expanduser()
     if not folder.is_dir():
         raise ToftrackError(f"there is no folder '{folder}'; give the folder of {name}")
@@ -158,14 +156,8 @@ def _msra(folder: Path, pattern: str) -> list[LabelledSequence]:
     if (folder / _MSRA_LABELS).is_file():
         return [_msra_sequence(folder, folder.name)]
     found = [path for path in folder.glob(pattern) if (path / _MSRA_LABELS).is_file()]
-    found.sort(key=_natural)
+    found.sort(key=lambda path: natural_order(path.as_posix()))
     return [_msra_sequence(path, path.relative_to(folder).as_posix()) for path in found]
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key that puts Subject2 before Subject10."""
-    parts = re.split(r"(\d+)", path.as_posix())
-    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
 
 def _msra_sequence(folder: Path, name: str) -> LabelledSequence:

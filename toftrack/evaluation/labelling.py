@@ -3,7 +3,6 @@ tracker says of them, and a file that grows click by click."""
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -22,7 +21,7 @@ from toftrack.detector.hand_detector import HandDetector
 from toftrack.devices.base import Device
 from toftrack.errors import ToftrackError, reported_errors
 from toftrack.evaluation.image_labels import Points, read_labels
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import write_json
 from toftrack.frames.camera import Camera
 from toftrack.hand.skeleton import FINGERS
 
@@ -266,8 +265,7 @@ class LabelFile:
         frames = {number: self.frames[number] for number in map(str, self.numbers())}
         what, remedy = f"the labels '{self.path}' cannot be written", "give another --output"
         with reported_errors(what, remedy, OSError, ValueError):  # what else is there may be NaN
-            text = json.dumps(self.content | {"frames": frames}, indent=1, allow_nan=False)
-            write_whole(self.path, text + "\n")
+            write_json(self.path, self.content | {"frames": frames}, allow_nan=False)
 
     def _frame(self, number: object) -> dict[str, Any]:
         if str(number) not in self.frames:

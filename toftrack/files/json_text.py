@@ -1,4 +1,4 @@
-"""JSON that others wrote: what cannot be meant is a ValueError, whatever Python makes of it."""
+"""JSON: ours, and what others wrote, of which what cannot be meant is a ValueError."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from toftrack.files.safe_files import open_to_read
+from toftrack.files.safe_files import open_to_read, write_whole
 
 MOST_BYTES = 2**26
 """No file of JSON here comes near 64 MB."""
@@ -40,6 +40,11 @@ def read_object(path: str | Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}
+
+
+def write_json(path: str | Path, content: Any, allow_nan: bool = True) -> None:
+    """Write a file as `write_whole`, for people to read, too; OSError, or ValueError for a NaN."""
+    write_whole(path, json.dumps(content, indent=1, allow_nan=allow_nan) + "\n")
 
 
 def _whole(digits: str) -> int:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import errno
 import io
 import os
+import re
 import secrets
 import stat
 from collections.abc import Collection, Iterator
@@ -247,6 +248,13 @@ def check_replaceable(path: str | Path) -> None:
     _check_kept(path)
     with suppress(FileNotFoundError):
         _refuse(path, os.lstat(path))
+
+
+def natural_order(name: str) -> list[tuple[int, int, str]]:
+    """Sorts names of files with numbers in them by value: 2 before 10."""
+    # By length, then by digits: Python makes no numbers of thousands of them.
+    parts = re.findall(r"0*([0-9]+)|([^0-9]+)", name)
+    return [(0, len(digits), digits) if digits else (1, 0, other) for digits, other in parts]
 
 
 def _refuse(path: str | Path, status: os.stat_result) -> None:

@@ -6,7 +6,6 @@ X = (u - cx) Z / fx and Y = (v - cy) Z / fy on the undistorted image.
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, field, fields
 from functools import cached_property
@@ -17,13 +16,13 @@ from typing import Any
 import cv2
 import numpy as np
 
-from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.errors import ToftrackError, check_format, reported_errors
+from toftrack.files.json_text import read_json, write_json
 from toftrack.frames.help_text import fields_in_help
 
 _FORMAT = "toftrack-camera"
 _VERSION = 1
+_REMEDY = "give a camera file (.json) that this toftrack wrote"
 _COUNTS = (4, 5, 8, 12, 14)
 """How many coefficients OpenCV's lens model may have."""
 _LENSES = ("opencv", "fisheye")
@@ -247,7 +246,7 @@ class Camera:
     def save(self, path: str | Path) -> None:
         """Write the camera as JSON. Raises ToftrackError when the file cannot be written."""
         with reported_errors(f"the camera file '{path}' cannot be written", "choose another place"):
-            write_whole(path, json.dumps(self.to_dict(), indent=1) + "\n")
+            write_json(path, self.to_dict())
 
     def to_dict(self) -> dict[str, Any]:
         """The content of a camera file, JSON-able."""
@@ -273,7 +272,7 @@ class Camera:
             raise ToftrackError("the camera file's name is empty; give the path of one (.json)")
         with reported_errors(
             f"the camera file '{path}' cannot be read",
-            "give a camera file (.json) that toftrack wrote",
+            _REMEDY,
             *(OSError, ValueError),
         ):
             content = read_json(Path(path).expanduser())
@@ -291,18 +290,9 @@ class Camera:
         return camera
 
     @classmethod
-    def from_dict(cls, content: object, path: str | Path) -> Camera:
+    def from_dict(cls, content: Any, path: str | Path) -> Camera:
         """The camera of `to_dict`; `path` is what errors name. Raises ToftrackError as `load`."""
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise ToftrackError(
-                f"'{path}' is not a camera file: its format is not '{_FORMAT}'; give a file that "
-                "toftrack wrote"
-            )
-        if content.get("version") != _VERSION:
-            raise ToftrackError(
-                f"the camera file '{path}' has version {content.get('version')!r}, but this "
-                f"toftrack reads version {_VERSION}; write it anew"
-            )
+        check_format(path, content, _FORMAT, _VERSION, "a camera file", _REMEDY)
         try:
             needed = {name: content[name] for name in ("K", "width", "height")}
             given = {one.name: content[one.name] for one in fields(cls) if one.name in content}

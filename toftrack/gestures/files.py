@@ -17,7 +17,6 @@ An angle that is left out, null or empty does not matter. Poses of the same name
 from __future__ import annotations
 
 import csv
-import json
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -26,8 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import read_json, write_json
 from toftrack.gestures import features
 from toftrack.hand.skeleton import ANGLE_LIMITS, ANGLE_NAMES, FINGERS
 from toftrack.pose_space.data.pose_files import SLACK_DEGREES, in_radians, named_cells, read_table
@@ -83,7 +81,7 @@ def save_poses(path: str | Path, poses: Sequence[NamedPose]) -> None:
     }
     what = f"the file of gestures '{path}' cannot be written"
     with reported_errors(what, "choose another place with --file FILE"):
-        write_whole(path, json.dumps(content, indent=1) + "\n")
+        write_json(path, content)
 
 
 def _in_degrees(angles_rad: np.ndarray) -> dict[str, float]:

@@ -10,7 +10,6 @@ capitate (Youm et al., J. Bone Joint Surg. 60-A, 1978), which puts the middle fi
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -20,9 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from toftrack.errors import ToftrackError, reported_errors
-from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.errors import ToftrackError, check_format, check_number, reported_errors
+from toftrack.files.json_text import read_json, write_json
 
 SIDES = ("right", "left")
 DEFAULT_HAND_LENGTH_M = 0.190
@@ -169,7 +167,7 @@ class HandShape:
             **{name: getattr(self, name).tolist() for name in _TENSORS},
             "fitted": self.fitted and self.fitted.content(),
         }
-        write_whole(path, json.dumps(content, indent=1) + "\n")
+        write_json(path, content)
 
     @staticmethod
     def load(path: str | Path) -> HandShape:
@@ -177,13 +175,7 @@ class HandShape:
         remedy = "give hand.shape=default or a file of a hand's shape"
         with reported_errors(f"{path} cannot be read", remedy, OSError, ValueError):
             content = read_json(path)
-        if not isinstance(content, dict) or content.get("format") != _FORMAT:
-            raise ToftrackError(f"{path} is not a hand shape file (its format is not {_FORMAT!r})")
-        if content.get("version") != _VERSION:
-            raise ToftrackError(
-                f"{path} is a hand shape of version {content.get('version')}, and this toftrack"
-                f" reads version {_VERSION}; write it again with this version"
-            )
+        check_format(path, content, _FORMAT, _VERSION, "a hand shape file", remedy)
         fitted = content.get("fitted")
         expected = (KeyError, TypeError, ValueError, AttributeError, RuntimeError)
         with reported_errors(f"{path} is a damaged hand shape file", remedy, *expected):
@@ -225,11 +217,8 @@ def default_hand_shape(
     hand_length_m: float = DEFAULT_HAND_LENGTH_M, side: str = "right", thickness: float = 1.0
 ) -> HandShape:
     """The mean adult hand, scaled to a hand length in metres; float32 on the CPU."""
-    if not 0.08 <= hand_length_m <= 0.30:
-        raise ToftrackError(
-            f"a hand length of {hand_length_m} m is outside 0.08 .. 0.30 m; give metres from"
-            " the wrist to the middle fingertip"
-        )
+    remedy = ", in metres from the wrist to the middle fingertip"
+    check_number("hand.length_m", hand_length_m, 0.08, 0.30, remedy=remedy)
     frames = [
         _rotation(abduction, 2) @ _rotation(elevation, 0) @ _rotation(roll, 1)
         for abduction, elevation, roll in _REST_DEGREES

@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from toftrack.hand.shape import HandShape
+from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
 from toftrack.hand.skeleton import HandPose
 
 # Everything in millimetres is for a hand of 190 mm, and scaled from there.
@@ -68,7 +68,6 @@ _STARTS, _STARTS_MM, _ENDS, _ENDS_MM, *_PAD_SIZES_MM = map(np.array, zip(*_PALM,
 _WRIST_MM = (0.0, 45.0, 0.0)
 _WRIST_AXES_MM = (50.0, 45.0, 45.0)
 
-_REFERENCE_LENGTH_M = 0.190
 _KEPT = 8
 """Shapes whose surface is kept: scorer, refiner and OpenXR's joints each want it."""
 _BONE_FRAMES = [1 + 3 * finger + bone for finger in range(5) for bone in (0, 1, 2, 0)]
@@ -120,7 +119,7 @@ def hand_surface(shape: HandShape) -> HandSurface:
     """Flesh out a skeleton of the given sizes; on the shape's device and of its dtype."""
     # In numpy, all bones at once: torch's operations on a few numbers take milliseconds together.
     base, lengths = shape.base_m.cpu().numpy(), shape.bone_lengths_m.cpu().numpy()
-    unit = shape.hand_length_m / _REFERENCE_LENGTH_M / 1000
+    unit = shape.hand_length_m / DEFAULT_HAND_LENGTH_M / 1000
     thick = unit * shape.thickness
     wrist = np.array([_WRIST_MM]) * unit, np.diag(_WRIST_AXES_MM)[None] * thick
     bones = _bones(lengths, np.array(BONE_RADII_MM, base.dtype) * thick)

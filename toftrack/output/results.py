@@ -17,10 +17,9 @@ from typing import Any, Self
 
 import numpy as np
 
-from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, check_format, reported_errors
 from toftrack.files.archives import read_archive
-from toftrack.files.json_text import parse_json, read_json
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import parse_json, read_json, write_json
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import Truth
 from toftrack.output.files import LINES, RUN_FORMAT, LineFile, make_way
@@ -91,7 +90,7 @@ class ResultWriter:
                 self._lines = unless_done.enter_context(closing(LineFile(self.folder)))
                 make_way(self.folder)
                 self._lines.clear()
-                _write_json(self.folder / "run.json", self._facts)
+                write_json(self.folder / "run.json", self._facts)
                 unless_done.pop_all()
         except OSError as error:
             raise self._unwritable(error) from error
@@ -198,7 +197,7 @@ def finish(
         metrics = run_metrics(records, rows, changed["index"], truth, counted)
         summary |= {"metrics": metrics} if metrics else {}
     write_results(folder / "track.npz", records, rows, changed | small)
-    _write_json(folder / "summary.json", summary)
+    write_json(folder / "summary.json", strict(summary))
     return summary
 
 
@@ -308,15 +307,10 @@ def read_run_facts(folder: Path) -> dict[str, Any]:
                 "that `toftrack track` wrote, such as outputs/DATE/TIME"
             )
         facts = read_json(path)
-    known = isinstance(facts, dict) and facts.get("format") == RUN_FORMAT
-    whole = known and isinstance(facts.get("joint_names"), list)
-    if not whole or not _are_metadata(facts.get("metadata")):
+    remedy = "give another folder, or use the toftrack that wrote it"
+    check_format(path, facts, RUN_FORMAT, _VERSION, "the description of a run", remedy)
+    if not isinstance(facts.get("joint_names"), list) or not _are_metadata(facts.get("metadata")):
         raise ToftrackError(f"'{path}' does not describe a run; give another folder")
-    if facts.get("version") != _VERSION:
-        raise ToftrackError(
-            f"'{path}' is of version {facts.get('version')}, but this toftrack reads version "
-            f"{_VERSION}; use the toftrack that wrote it"
-        )
     return facts
 
 
@@ -327,10 +321,6 @@ def _are_metadata(metadata: Any) -> bool:
     parts = {name: metadata.get(name) or {} for name in _PARTS}
     whole = all(isinstance(part, dict) for part in parts.values())
     return whole and isinstance(parts["config"].get("device") or {}, dict)
-
-
-def _write_json(path: Path, content: dict[str, Any]) -> None:
-    write_whole(path, json.dumps(strict(content), indent=1, allow_nan=False) + "\n")
 
 
 _MANY = 0.05

@@ -20,7 +20,7 @@ import numpy as np
 
 from toftrack.errors import ToftrackError
 from toftrack.evaluation.measures import REGION_FIGURES, Estimates, Measured, evaluate, measured
-from toftrack.evaluation.statistics import text_of
+from toftrack.evaluation.statistics import figure, text_of
 from toftrack.evaluation.trust import RIGHT_FRAMES
 from toftrack.frames.frame import Truth
 from toftrack.hand.shape import DEFAULT_HAND_LENGTH_M, HandShape
@@ -53,7 +53,7 @@ def summarise(
         "mean_ms": 1e3 * float(seconds.mean()) if done else None,
         "median_ms": 1e3 * float(np.median(seconds)) if done else None,
         "fps": done / total if total > 0 else None,
-        "mean_score": _mean(scores[there] if records.slots > 1 else scores),
+        "mean_score": figure(scores[there] if records.slots > 1 else scores),
     }
     if records.slots == 1:
         return summary | _hand(folder, 0, metadata)
@@ -64,14 +64,10 @@ def summarise(
             "slot": slot,
             "frames": int(here.sum()),
             "lost_frames": int((lost[:, slot] & here).sum()),
-            "mean_score": _mean(scores[here, slot]),
+            "mean_score": figure(scores[here, slot]),
         }
         slots.append(of_slot | (_hand(folder, slot, metadata) if here.any() else {}))
     return summary | {"slots": slots}
-
-
-def _mean(values: np.ndarray) -> float | None:
-    return float(values.mean()) if values.size else None
 
 
 def _hand(folder: Path, slot: int, metadata: dict[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import torch
 from threadpoolctl import threadpool_limits
 
 from toftrack.configuration.plugins import installed, named_object
-from toftrack.errors import ToftrackError, check_choice, reported_errors
+from toftrack.errors import ToftrackError, check_choice, check_format, reported_errors
 from toftrack.files.archives import read_archive, write_archive
 from toftrack.files.json_text import parse_json
 from toftrack.hand.skeleton import ANGLE_NAMES
@@ -117,13 +117,7 @@ def load_pose_space(path: str | Path, configured: str = "pca") -> PoseSpace:
     with reported_errors(what, _ADVICE, OSError, ValueError, KeyError):
         arrays = read_archive(path)
         header = parse_json(str(arrays.pop("header")))
-        if not isinstance(header, dict) or header.get("format") != FORMAT:
-            raise ValueError("its header is another")
-    if header.get("version") != VERSION:
-        raise ToftrackError(
-            f"{path} is a pose space of version {header.get('version')} and this toftrack reads"
-            f" version {VERSION}; {_ADVICE}"
-        )
+    check_format(path, header, FORMAT, VERSION, "a pose-space file", _ADVICE)
     kind, labels = header.get("kind"), header.get("training_labels")
     made = kind_of_space(configured)
     if kind != made.kind:

@@ -7,7 +7,6 @@ that matter, turned to all sides, slowly. The camera file serves every device: `
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -22,6 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, reported_errors
+from toftrack.files.json_text import write_json
 from toftrack.files.safe_files import check_replaceable, write_whole
 from toftrack.frames import calibration
 from toftrack.frames.calibration import DepthFit, DepthPairs, Lens, View
@@ -93,7 +93,7 @@ def main(arguments: Sequence[str]) -> None:
     with reported_errors(what, "choose another with --report"):
         folder.mkdir(parents=True, exist_ok=True)
         write_whole(folder / "report.txt", text + "\n")
-        write_whole(folder / "report.json", json.dumps(facts, indent=1) + "\n")
+        write_json(folder / "report.json", facts)
         write_picture(folder / "corners.png", _corner_sheet(lens.views, images, board))
         chart.write_figures(folder, [("depth_error.png", lambda: _error_plot(facts))])
     print(text)

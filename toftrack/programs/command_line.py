@@ -10,7 +10,6 @@ import argparse
 import contextlib
 import difflib
 import functools
-import json
 import logging
 import math
 import os
@@ -32,8 +31,8 @@ from omegaconf import DictConfig
 from toftrack.configuration.check import check_interpolations, check_overrides
 from toftrack.configuration.sentences import FULL_ERROR, place_of, sentence
 from toftrack.errors import ToftrackError, check_number
-from toftrack.files.json_text import read_object
-from toftrack.files.safe_files import leave_folder, let_links_go, write_whole
+from toftrack.files.json_text import read_object, write_json
+from toftrack.files.safe_files import leave_folder, let_links_go
 from toftrack.output.files import own_folder
 from toftrack.programs import shutdown
 
@@ -183,7 +182,7 @@ def sweep_job(task: Callable[[DictConfig], float]) -> Callable[[DictConfig], flo
             # cannot be written must not stop the sweep.
             with contextlib.suppress(OSError):
                 content = read_object(path) | {"error": sentence(error)}
-                write_whole(path, json.dumps(content, indent=1) + "\n")
+                write_json(path, content)
             return math.inf
 
     return guarded

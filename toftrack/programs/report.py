@@ -23,8 +23,9 @@ import numpy as np
 import yaml
 
 from toftrack.errors import ToftrackError, one_line, reported_errors
+from toftrack.evaluation.statistics import text_of
 from toftrack.files.json_text import read_json
-from toftrack.files.safe_files import open_to_read, write_whole
+from toftrack.files.safe_files import natural_order, open_to_read, write_whole
 from toftrack.programs.command_line import plain_parser
 from toftrack.views.figures import chart
 
@@ -84,10 +85,8 @@ def read_runs(folder: str | Path) -> list[Run]:
             " sweep, multirun/DATE/TIME"
         )
 
-    def natural(path: Path) -> list[tuple[int, str]]:
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in path.parts]
-
-    return [_read_run(path, folder) for path in sorted(found, key=natural)]
+    found.sort(key=lambda path: natural_order(path.as_posix()))
+    return [_read_run(path, folder) for path in found]
 
 
 def _read_run(path: Path, folder: Path) -> Run:
@@ -124,7 +123,7 @@ def _flat(summary: dict[str, Any], prefix: str = "") -> dict[str, float]:
     for name, value in summary.items():
         if isinstance(value, dict):
             figures |= _flat(value, f"{prefix}{name}.")
-        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+        elif type(value) in (int, float) and math.isfinite(value):
             figures[_printable(prefix + name)] = value
     return figures
 
@@ -215,9 +214,10 @@ def _table(groups: Sequence[Group], figure: str) -> str:
     lines = [f" #  runs failed  {column:>{wide}}   spread    ms/frame  settings"]
     for number, group in enumerate(groups, 1):
         failed = sum(run.error is not None for run in group.runs)
+        error, spread = text_of(group.error, digits), text_of(group.spread, digits)
         lines.append(
-            f"{number:2d} {len(group.runs):5d} {failed:6d}  {_text(group.error, digits):>{wide}}"
-            f" {_text(group.spread, digits):>8}  {_text(group.cost_ms, 1):>10}  {group.settings}"
+            f"{number:2d} {len(group.runs):5d} {failed:6d}  {error:>{wide}} {spread:>8}"
+            f"  {text_of(group.cost_ms, 1):>10}  {group.settings}"
         )
     names = list(dict.fromkeys(name for group in groups for name in group.recordings))
     if len(names) > 1:
@@ -225,7 +225,7 @@ def _table(groups: Sequence[Group], figure: str) -> str:
         width = max(8, *map(len, short))
         lines += ["", " #  " + " ".join(f"{name:>{width}}" for name in short)]
         for number, group in enumerate(groups, 1):
-            cells = [_text(group.recordings.get(name), digits) for name in names]
+            cells = [text_of(group.recordings.get(name), digits) for name in names]
             lines.append(f"{number:2d}  " + " ".join(f"{cell:>{width}}" for cell in cells))
     done = [run for group in groups for run in group.runs if run.error is None]
     if without := sum(figure not in run.figures for run in done):
@@ -236,10 +236,6 @@ def _table(groups: Sequence[Group], figure: str) -> str:
             f" have: {', '.join(early)}"
         )
     return "\n".join(lines)
-
-
-def _text(value: float | None, digits: int) -> str:
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def report(folder: str | Path, figure: str | None = None) -> tuple[list[Run], list[Group]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import sys
 from functools import partial
@@ -15,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from toftrack.errors import ToftrackError, check_number
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import write_json
 from toftrack.pose_space.data.pose_data import PoseData
 from toftrack.pose_space.files import fit_pose_space, save_pose_space
 from toftrack.pose_space.held_out import Errors, Row, errors_table, evaluate_space, spaces_to_learn
@@ -82,7 +81,7 @@ def train(config: DictConfig) -> float:
     measured = asked.training if clips == 1 else asked.reached
     error = math.inf if measured is None else measured.degrees
     summary = _summary(kind, data, rows, asked)
-    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    write_json(folder / "summary.json", summary)
     say("\n".join(f"  {path}" for path in (model, *figures, folder / "summary.json")))
     say(f"use it: {_command(model)}")
     if in_sweep():

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import os
-import re
 import stat
 import zipfile
 from collections.abc import Callable
@@ -18,8 +16,8 @@ import numpy as np
 
 from toftrack.errors import ToftrackError, check_number, reported_errors
 from toftrack.files.archives import MOST_TEXT_BYTES, broken_is_value_error
-from toftrack.files.json_text import parse_json
-from toftrack.files.safe_files import open_new, open_to_read, write_whole
+from toftrack.files.json_text import parse_json, write_json
+from toftrack.files.safe_files import natural_order, open_new, open_to_read
 from toftrack.frames.camera import Camera
 from toftrack.recordings.bare import (
     MILLIMETRE,
@@ -181,14 +179,14 @@ def _sorted_out(files: Files) -> tuple[list[str], list[str], str | None]:
     """Depth and amplitude images, and what else there is, in words; ToftrackError where no depth is
     to be told from the rest."""
     images = [n for n in files.names if _is_image(n) and not _last(n).startswith(".")]
-    images = sorted(sorted(images), key=_order)
+    images = sorted(sorted(images), key=natural_order)
     grey = [name for name in images if not _surely_no_depth(files, name)]
     amplitude = [n for n in grey if _last(n).lower().startswith("amplitude")]
     known = set(amplitude)
     depth = [name for name in grey if name not in known]
     # Infrared has 16 bits, too.
     depth = [name for name in depth if "depth" in name.lower()] or depth
-    others = sorted(set(images) - {*depth, *amplitude}, key=_order)
+    others = sorted(set(images) - {*depth, *amplitude}, key=natural_order)
     if not depth:
         there = f"; '{others[0]}' is a picture of colours or of 8 bits" if others else ""
         raise ToftrackError(
@@ -291,7 +289,7 @@ def write_image_folder(
                 f"the folder '{folder}' has images, {_CAMERA} or {_TIMES} already; choose an empty "
                 "one"
             )
-        write_whole(folder / _CAMERA, json.dumps(content, indent=1) + "\n")
+        write_json(folder / _CAMERA, content)
         with io.TextIOWrapper(open_new(folder / _TIMES), encoding="utf-8") as times:
             for number, time_s in enumerate(store.timestamp_s):
                 depth_m, amplitude = store.image(number)
@@ -316,10 +314,3 @@ def _timestamps(files: Files, depth: list[str]) -> np.ndarray | None:
         if len(words) != count or not np.isfinite(times).all() or (np.diff(times) < 0).any():
             raise ValueError("too few, too many, backwards or not finite")
     return times
-
-
-def _order(name: str) -> list[tuple[int, int, str]]:
-    """Sorts names with numbers in them by value: 2 before 10."""
-    # By length, then by digits: Python makes no numbers of thousands of them.
-    parts = re.findall(r"0*([0-9]+)|([^0-9]+)", name)
-    return [(0, len(digits), digits) if digits else (1, 0, other) for digits, other in parts]

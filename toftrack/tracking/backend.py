@@ -10,7 +10,7 @@ from torch import Tensor
 
 from toftrack.compute import rigid, rigid_numba
 from toftrack.compute.rigid import Motions
-from toftrack.errors import ToftrackError
+from toftrack.errors import ToftrackError, check_choice
 from toftrack.hand.shape import HandShape
 from toftrack.render.likelihood import Likelihood, checked_score
 from toftrack.render.numba.scorer import NumbaScorer
@@ -59,13 +59,10 @@ def choose_backend(renderer: str, device: torch.device | str = "cpu") -> Backend
     device: of the particles. What a back end does not know to do there is done in torch.
     Raises ToftrackError for an unknown name or a back end that cannot run here.
     """
+    check_choice("renderer", renderer, ("auto", *BACK_ENDS))
     device = torch.device(device)
     fastest = "triton" if device.type == "cuda" else "numba"
     wanted = fastest if renderer == "auto" else renderer
-    if wanted not in BACK_ENDS:
-        raise ToftrackError(
-            f"renderer={renderer} is unknown; give one of auto, {', '.join(BACK_ENDS)}"
-        )
     try:
         return _make(wanted, device)
     except ImportError as error:

@@ -5,7 +5,6 @@ judged on.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, replace
@@ -19,7 +18,7 @@ from tqdm import tqdm
 
 from toftrack.api import make_tracker
 from toftrack.errors import ToftrackError
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import write_json
 from toftrack.hand.regions import REGION_90, joint_axes
 from toftrack.tracking.confidence import (
     FEATURES,
@@ -103,7 +102,7 @@ def fit_confidence(asked: argparse.Namespace) -> None:
     seen = with_doubt(seen, log_odds, model.lost.memory)
     belief, more = _fitted_joints(seen, kept)
     summary |= more
-    write_whole(asked.output / "summary.json", json.dumps(summary, indent=1) + "\n")
+    write_json(asked.output / "summary.json", summary)
     fitted = {
         part: {name: of[name] for name in ("intercept", "weights")}
         for part, of in (("every_joint", summary), ("whole", summary["whole"]))
@@ -111,8 +110,7 @@ def fit_confidence(asked: argparse.Namespace) -> None:
     # Scale and odds of the joints are not fitted on rendered sequences: they stay.
     before = model.lost.joints
     joints = replace(belief, scale=before.scale, odds=before.odds)
-    content = json.dumps(fitted | {"joints": asdict(joints)}, indent=1)
-    write_whole(asked.output / "confidence.json", content + "\n")
+    write_json(asked.output / "confidence.json", fitted | {"joints": asdict(joints)})
     picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
     write_picture(asked.output / "reliability.png", picture)
     print(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from pathlib import Path
@@ -15,7 +14,7 @@ from omegaconf import DictConfig
 
 from toftrack.configuration.sentences import sentence
 from toftrack.errors import ToftrackError, check_number
-from toftrack.files.safe_files import write_whole
+from toftrack.files.json_text import write_json
 from toftrack.programs.command_line import sweep_job
 from toftrack.views.pictures import write_picture
 
@@ -89,7 +88,7 @@ def train(config: DictConfig) -> float:
             about[f"{name}_restart_images"] = schedule.restart_images
     save_weights(path, pose_network, finder_network, about)
     summary = about | {"poses": pose_course, "finder": finder_course}
-    write_whole(folder / "summary.json", json.dumps(summary, indent=1) + "\n")
+    write_json(folder / "summary.json", summary)
     error_mm, learned, pictures = math.nan, "", ["images.png"]
     if pose_course:
         write_picture(folder / "course.png", course_figure(pose_course))

@@ -18,7 +18,7 @@ import numpy as np
 
 from toftrack.devices.live import OTHER_FILE, SdkCamera, Size, chosen_profile, chosen_serial
 from toftrack.devices.realsense.emulator import FIRST_NUMBER, EmulatedCamera, EmulatorSettings
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import ToftrackError, check_choice, reported_errors
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 
@@ -52,8 +52,7 @@ class RealSense(SdkCamera):
         camera_file: str | Path | None,
         emulated: EmulatorSettings,
     ) -> None:
-        if transport not in ("usb", "emulated"):
-            raise ToftrackError(f"device.transport={transport} is unknown; give usb or emulated")
+        check_choice("device.transport", transport, ("usb", "emulated"))
         if bag is not None and transport == "emulated":
             raise ToftrackError(
                 "device.bag already gives the frames; leave out device.transport=emulated (whose "

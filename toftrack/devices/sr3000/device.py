@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from toftrack.devices.base import BaseDevice, check_keep
+from toftrack.devices.base import KEEP, BaseDevice
 from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
 from toftrack.devices.sr3000.libmesasr import MesaTransport
 from toftrack.devices.sr3000.transport import (
@@ -30,7 +30,7 @@ from toftrack.devices.sr3000.transport import (
     UsbSettings,
 )
 from toftrack.devices.sr3000.usb import WHEN_IT_DOES_NOT_ANSWER, UsbTransport
-from toftrack.errors import ToftrackError, check_number
+from toftrack.errors import ToftrackError, check_choice, check_number
 from toftrack.frames.camera import Camera
 from toftrack.frames.frame import Frame
 from toftrack.recordings.sr_frame import HEIGHT, WIDTH, decode_frame, nominal_camera
@@ -67,7 +67,8 @@ class Sr3000(BaseDevice):
         persistence: Persistence,
         camera_file: str | Path | None,
     ) -> None:
-        check_keep(keep)
+        check_choice("device.keep", keep, KEEP)
+        check_choice("device.transport", transport, ("usb", "libmesasr", "emulated"))
         check_number("device.queue_frames", queue_frames, 1, whole=True)
         check_number("device.fps", fps, 0, above=True)
         if stop is not None:
@@ -87,13 +88,9 @@ class Sr3000(BaseDevice):
         number = None if serial is None else str(serial)
         if transport == "libmesasr":
             self._transport = MesaTransport(libmesasr, self.exposure, number)
-        elif transport in ("usb", "emulated"):
+        else:
             backend = self._emulate(emulated) if transport == "emulated" else None
             self._transport = UsbTransport(usb, self.exposure, number, backend)
-        else:
-            raise ToftrackError(
-                f"device.transport={transport} is unknown; give usb, libmesasr or emulated"
-            )
         self._transport.check()
         if camera_file is not None:
             self.camera = Camera.load_for(camera_file, WIDTH, HEIGHT, "the SR3000")
