@@ -31,6 +31,7 @@ WRONG = [
     ("filter.spread=3", "it has settings of its own; give these, as filter.spread.translation_m="),
     ("gestures.pinch=null", "it has settings of its own; give these, as gestures.pinch.touching="),
     ("likelihood=3", "a group takes the name of one of its choices"),
+    ("hand=[1,2]", "a group takes the name of one of its choices"),
     ("experiment=null", "experiment=none means no experiment"),
     ("filter.spread.depth_m=1e30", "give a number of at least 0 and at most 10"),
     # What was probably meant.

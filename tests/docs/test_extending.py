@@ -403,9 +403,10 @@ def test_what_a_socket_sends_wrongly_is_one_sentence(sent: bytes | None, words: 
             def send() -> None:
                 opened.enter_context(server.accept()[0]).sendall(sent)
 
-            threading.Thread(target=send).start()
+            threading.Thread(target=send, daemon=True).start()
         port = 1 if sent is None else server.getsockname()[1]
-        overrides = ("device=socket", f"device.port={port}", "device.timeout_s=0.2")
+        patience = f"device.timeout_s={0.2 if 'nothing' in words else 60}"
+        overrides = ("device=socket", f"device.port={port}", patience)
         with pytest.raises(ToftrackError, match=words):
             device = toftrack.make_device(*overrides, config_dir=EXAMPLES)
             next(iter(opened.enter_context(device)))

@@ -85,8 +85,9 @@ def test_bare_images_are_converted_when_their_lens_is_given(tmp_path: Path) -> N
     np.testing.assert_allclose(made.depth, words * 0.0005, rtol=1e-6)
     np.testing.assert_array_equal(made.camera.K, [[30, 0, 15.5], [0, 31, 11.5], [0, 0, 1]])
     assert made.fps == pytest.approx(12.5)
-    with pytest.raises(ToftrackError, match="--intrinsics"):
-        convert.main([str(path), str(tmp_path / "other.npz")])
+    for more, said in ([], "--intrinsics"), ([*lens, "--dataset", "x"], "has no dataset x"):
+        with pytest.raises(ToftrackError, match=said):
+            convert.main([str(path), str(tmp_path / "other.npz"), *more])
 
 
 def test_the_lens_goes_before_an_npz_s_own_and_other_facts_stand_in_for_missing_ones(
