@@ -6,6 +6,7 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -191,7 +192,7 @@ def test_lost_frames_are_shown_and_shaded(
         assert share(new, chart.SHADE) > share(old, chart.SHADE) + 0.01, name
 
 
-def test_two_hands_have_figures_of_their_own_and_one_filmstrip(run: Path) -> None:
+def test_two_hands_have_figures_of_their_own_and_one_filmstrip(run: Path, monkeypatch) -> None:
     """The second slot has a hand from frame 4 on, of which the recording knows nothing."""
 
     def beside(values: np.ndarray) -> np.ndarray:
@@ -206,7 +207,10 @@ def test_two_hands_have_figures_of_their_own_and_one_filmstrip(run: Path) -> Non
     summary = json.loads((run / "summary.json").read_text())
     summary["metrics"]["slot"] = 0
     (run / "summary.json").write_text(json.dumps(summary))
+    monkeypatch.setattr(chart, "titled", titled := Mock(wraps=chart.titled))
     shown = {path.stem: cv2.imread(str(path)) for path in draw_figures(run)}
+    titles = "".join(call.args[1] for call in titled.call_args_list)
+    assert titles.count("Slot 0, right hand. ") == titles.count("Slot 1, right hand. ") == 4
     assert list(shown) == [*NAMES, *(f"{name}_2" for name in NAMES if name != "filmstrip")]
     assert share(shown["course"], chart.BLUE) > 0 == share(shown["course_2"], chart.BLUE)
     assert share(shown["filmstrip"], SLOT_RGB[1][::-1]) > 0
