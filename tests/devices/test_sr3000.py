@@ -17,7 +17,7 @@ from toftrack.devices.replay import Sample
 from toftrack.devices.sr3000 import usb as sr3000_usb
 from toftrack.devices.sr3000.device import Sr3000
 from toftrack.devices.sr3000.emulator import EmulatedBackend, EmulatorSettings
-from toftrack.devices.sr3000.transport import Exposure
+from toftrack.devices.sr3000.transport import EndOfStreamError, Exposure
 from toftrack.devices.sr3000.usb import UsbTransport
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
@@ -280,6 +280,30 @@ def test_stopping_delivers_what_was_received() -> None:
                 device.request_stop()
     assert len(indices) == device.counts.received > 15
     assert indices == list(range(len(indices)))
+
+
+def test_a_camera_that_hangs_in_a_call_is_not_closed_beneath_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    first, goes_on, acquired = [True], threading.Event(), UsbTransport.acquire
+
+    def acquire(transport: UsbTransport) -> bytes:
+        if first:
+            first.clear()
+            return acquired(transport)
+        goes_on.wait()
+        raise EndOfStreamError
+
+    monkeypatch.setattr(UsbTransport, "acquire", acquire)
+    device = camera()
+    frames = iter(device)
+    next(frames)
+    try:
+        device.close()
+        assert device.emulator.open_handles  # or a driver's library would crash the process
+    finally:
+        goes_on.set()
+        frames.close()
 
 
 def test_every_kind_of_fault_in_turn_and_every_good_frame_accounted_for() -> None:
