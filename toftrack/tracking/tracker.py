@@ -80,7 +80,7 @@ class HandsTracker:
             model = self.model.at_quality(quality)
             self.state, self.infos, estimates = _step(self.state, image, model)
         of_frame = {"compute_s": self.time.took_s(), "image_size_px": depth_m.shape[::-1]}
-        return tuple(_own(estimate).updated(**of_frame) for estimate in estimates)
+        return tuple(estimate.updated(**_own(estimate), **of_frame) for estimate in estimates)
 
     @small_operations()
     def prepare(self) -> None:
@@ -198,10 +198,9 @@ class Tracker:
         return self.hands.shapes[0]
 
 
-def _own(estimate: Estimate) -> Estimate:
-    """With arrays that the caller may change: the state keeps the last estimate for lost frames."""
-    arrays = {name: a for name, a in vars(estimate).items() if isinstance(a, np.ndarray)}
-    return estimate.updated(**{name: array.copy() for name, array in arrays.items()})
+def _own(estimate: Estimate) -> dict[str, np.ndarray]:
+    """Its arrays, for the caller to change: the state keeps the last estimate for lost frames."""
+    return {name: a.copy() for name, a in vars(estimate).items() if isinstance(a, np.ndarray)}
 
 
 def _step(state: TrackerState, image: DepthImage, model: FilterModel) -> StepResult:
