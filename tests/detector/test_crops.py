@@ -22,6 +22,7 @@ from toftrack.detector.crops import (
     WIDE_RANGE_M,
     crop_at,
     crop_rotation,
+    thinned,
     wide,
 )
 from toftrack.detector.detection import OF_HYPOTHESES, Detection, doubted_sigma_m
@@ -150,6 +151,28 @@ def test_the_whole_image_keeps_its_rays() -> None:
         ray = ((u - new_k[0, 2]) / new_k[0, 0], (v - new_k[1, 2]) / new_k[1, 1])
         true = ((column - k[0, 2]) / focal, (row - k[1, 2]) / focal)
         assert ray == pytest.approx(true, abs=1.0 / WIDE_F_PX)
+
+
+@pytest.mark.parametrize(
+    "focal,height,width,step",
+    [(200.0, 144, 176, 1), (499.0, 480, 640, 1), (640.0, 720, 1280, 2), (1500.0, 720, 1281, 6)],
+)
+def test_a_fine_image_keeps_every_nth_reading_and_its_rays(
+    focal: float, height: int, width: int, step: int
+) -> None:
+    k, (v, u) = intrinsics(focal, height, width), np.indices((height, width), np.float32)
+    x, y = (u - k[0, 2]) / focal, (v - k[1, 2]) / focal
+    small, new_k = thinned(x.astype(np.float32), k)
+    assert small.shape == tuple(len(range((step - 1) // 2, n, step)) for n in (height, width))
+    rows, columns = np.indices(small.shape)
+    np.testing.assert_allclose(small, (columns - new_k[0, 2]) / new_k[0, 0], atol=1e-6)
+    small, _ = thinned(y.astype(np.float32), k)
+    np.testing.assert_allclose(small, (rows - new_k[1, 2]) / new_k[1, 1], atol=1e-6)
+
+
+def test_few_pixels_stay_however_long_the_lens() -> None:
+    depth = np.full((12, 16), 0.5, np.float32)
+    assert thinned(depth, intrinsics(5000.0, 12, 16))[0] is depth
 
 
 @pytest.mark.parametrize("height", [48, 50])

@@ -133,6 +133,19 @@ def test_a_mirrored_sequence_of_a_left_hand_gives_the_same_error(default: Run) -
     assert run.tracker.shape.side == "left"
 
 
+def test_a_camera_with_eight_times_as_many_rows_shows_the_same_hand_in_its_own_pixels(
+    default: Run,
+) -> None:
+    few, k = first(12), first(12).k.copy()
+    k[:2] *= 8
+    k[:2, 2] += 3.5
+    fine = Scene(few.depth_m.repeat(8, 1).repeat(8, 2), k, few.joints_m)
+    run = Run(fine)
+    assert run.error_mm[5:].mean() < 12
+    last = run.estimates[-1]
+    assert last.landmarks[:, :2] == pytest.approx(default.estimates[11].landmarks[:, :2], abs=0.02)
+
+
 WRONG = "filter.resampling=residual filter.bounds=clip filter.passes=1.5 lost.believe=60"
 
 

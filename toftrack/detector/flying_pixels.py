@@ -8,13 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from toftrack.compute.compiling import compiled, shared_entry_point
-from toftrack.compute.threads import run_shared
+from toftrack.compute.compiling import compiled, entry_point
 
 _FAR = np.float32(np.inf)
 """The depth beyond the image's rows, which no reading is near to; and a gap larger than any."""
-_ROWS, _WORTH_A_THREAD = 64, 400_000
-"""Rows that a thread looks at in one go; and pixels for which it pays to wake a second one."""
 
 
 def without_flying_pixels(depth_m: np.ndarray, k: np.ndarray, widths: float) -> np.ndarray:
@@ -28,27 +25,21 @@ def without_flying_pixels(depth_m: np.ndarray, k: np.ndarray, widths: float) -> 
     if widths <= 0:
         return depth_m
     depth = np.ascontiguousarray(depth_m, np.float32)
-    left, part = np.empty_like(depth), np.float32(widths / float(k[0, 0]))
-    rows = iter(range(0, len(depth), _ROWS))
-
-    def look() -> None:
-        for first in rows:
-            _sweep(depth, part, first, first + _ROWS, left)
-
-    run_shared(look, depth.size // _WORTH_A_THREAD)
+    left = np.empty_like(depth)
+    _sweep(depth, np.float32(widths / float(k[0, 0])), left)
     return left
 
 
-@shared_entry_point
-def _sweep(depth, part, first, end, left):
-    """Rows `first` to `end` of an image, see above, into `left`.  part: of a depth.
+@entry_point
+def _sweep(depth, part, left):
+    """An image, see above, into `left`.  part: of a depth.
 
     The outer columns stay. By the second least of eight gaps, which LLVM computes for many pixels
     at once; counting takes twice as long.
     """
     height, width, nothing = depth.shape[0], depth.shape[1], np.float32(0)
     beyond = np.full(width, _FAR, np.float32)
-    for v in range(first, min(end, height)):
+    for v in range(height):
         row = depth[v]
         above = depth[v - 1] if v > 0 else beyond
         below = depth[v + 1] if v < height - 1 else beyond

@@ -88,7 +88,7 @@ def report(
         if row is None:
             slot = state.slots[number]
             slot = slot if slot.track in unseen else changed(slot, track=-1)
-            slot, estimate = report_absence(slot, scene.image, scene.model, len(state.slots))
+            slot, estimate = report_absence(slot, scene.taken, scene.model, len(state.slots))
             reports.append((slot, None, estimate))
         else:
             reports.append(report_track(number, results[row], rights[row], state, scene, spans))
@@ -144,12 +144,13 @@ def report_track(
     slot, track, view, model = state.slots[number], one.track, one.view, scene.model
     if slot.track != track.number:
         slot = changed(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
-    image = scene.image  # as the camera took it, and not reduced
+    taken = scene.taken
     estimate = make_estimate(
-        image, one.filtered, track.pose, one.score, one.status, view.fitted, model
+        taken, one.filtered, track.pose, one.score, one.status, view.fitted, model
     )
+    score, last = one.score, slot.joint_features
     rows = joint_features(
-        estimate.joints_m, view.detection, slot.joint_features, one.score, track.log_odds, image
+        estimate.joints_m, view.detection, last, score, track.log_odds, scene.image
     )
     sigma, confidence = model.lost.joints.judge(rows)
     estimate = with_side(estimate, track.side, right, side_of_slot(number, state))
@@ -160,7 +161,7 @@ def report_track(
         joint_confidence=confidence,
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
-    slot, estimate = finish_estimate(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
+    slot, estimate = finish_estimate(slot, taken, estimate, view.fitted.shape, scene.dt_s, model)
     slot = changed(
         slot,
         track=track.number,

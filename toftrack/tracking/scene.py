@@ -10,8 +10,9 @@ import numpy as np
 import torch
 
 from toftrack.compute.compiling import entry_point
-from toftrack.detector.crops import CROP_M
+from toftrack.detector.crops import CROP_M, thinned
 from toftrack.detector.detection import Detection
+from toftrack.detector.flying_pixels import without_flying_pixels
 from toftrack.detector.parts import FOREARM_PART
 from toftrack.frames.frame import DepthImage
 from toftrack.render.model_image import range_image
@@ -35,12 +36,22 @@ Arm = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A frame's image, dt_s after the last frame, and the hands predicted in it."""
+    """A frame's image, dt_s after the last frame, and the hands predicted in it.
+
+    taken: the image in the camera's resolution.
+    """
 
     tracks: Sequence[Track]
-    image: DepthImage
+    taken: DepthImage
     dt_s: float
     model: TrackerModel
+
+    @cached_property
+    def image(self) -> DepthImage:
+        """The image that all looks at, see `thinned`, without flying pixels."""
+        depth_m, k = thinned(self.taken.depth_m, self.taken.k)
+        depth_m = without_flying_pixels(depth_m, k, self.model.detector.settings.flying)
+        return replace(self.taken, depth_m=depth_m, k=k)
 
     @cached_property
     def hands(self) -> tuple[PredictedHand, ...]:

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import torch
 
 from toftrack.compute.pace import FRAME_S, Duration, Spans
 from toftrack.compute.threads import small_operations
-from toftrack.detector.flying_pixels import without_flying_pixels
 from toftrack.frames.frame import DepthImage
 from toftrack.refinement import shape_fit
 from toftrack.refinement.steadying import steadied
@@ -38,7 +36,8 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     particle filter with data-driven proposals (ICONDENSATION: Isard and Blake, ECCV 1998) and local
     optimisation of few hypotheses (Gall et al., IJCV 87, 2010):
 
-    1. Leave out flying pixels; predict each track's hand, and which track owns which pixels.
+    1. Thin the image and leave out flying pixels; predict each track's hand, and which track owns
+       which pixels.
     2. Filter: resample, diffuse and weigh all tracks' particles (B, N, 6 + d) by the F-measure of
        the image, in annealed passes (Deutscher and Reid, IJCV 61, 2005). Meanwhile
     3. detect: the pose network, which votes for joints (A2J: Xiong et al., ICCV 2019), looks at
@@ -52,8 +51,6 @@ def step(state: TrackerState, image: DepthImage, model: TrackerModel) -> StepRes
     spans, generator, dt_s = Spans(), state.random_generator(), state.elapsed_s(image)
     state = state.at(image)
     with spans("detector"):
-        depth_m = without_flying_pixels(image.depth_m, image.k, model.detector.settings.flying)
-        image = replace(image, depth_m=depth_m)
         scene = Scene(state.tracks, image, dt_s, model)
         rows = range(len(scene.hands))
         pending = start_detection(scene, state)
