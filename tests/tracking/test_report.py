@@ -133,6 +133,17 @@ def test_tracks_come_into_slots(
     assert numbers(state, *tracks[::-1]) == expected, "in whichever row"
 
 
+def test_the_first_hand_takes_the_only_slot_when_it_is_believed_later_than_another() -> None:
+    """As the one held out, which is first, after a farther one that is seen better."""
+    tentative = hand(0, confirmed=False)
+    state, _ = reported(before(), tentative, LEFT)
+    assert state.slots[0].track == 1 and state.slots[0].known is None
+    assert numbers(state, tentative, LEFT) == [1]
+    assert numbers(state, RIGHT, LEFT) == [0]
+    alone, _ = reported(before(), LEFT)
+    assert numbers(alone, RIGHT, LEFT) == [1], "of one that comes later it keeps the slot"
+
+
 @pytest.mark.parametrize("told", ["right", "left"])
 @pytest.mark.parametrize("first", ["right", "left"])
 def test_of_two_slots_the_first_is_of_the_told_side(told: str, first: str) -> None:

@@ -114,11 +114,12 @@ def assign_slots(
 def _worth(number: int, slot: Slot, track: Track, right: float, state: TrackerState) -> float:
     """A track's worth to slot `number`; 0 or less where it may not take it.  right: log odds."""
     count, wanted = len(state.slots), side_of_slot(number, state)
-    # Where nobody said which hand is meant, tracks that are probably right are worth the same: the
+    # While nobody knows which hand is meant, tracks that are probably right are worth the same: the
     # first is the one held out (detect.held_out_first), another may just be seen better.
-    most = 0.0 if count == 1 and wanted is None and slot.known is None else _MOST
+    unknown = count == 1 and wanted is None and slot.known is None
+    most = 0.0 if unknown else _MOST
     worth = _CONFIRMED * track.confirmed + min(max(track.log_odds, -_MOST), most) + _MOST
-    stays = slot.track == track.number
+    stays = slot.track == track.number and not unknown
     # Of hands that are worth the same, the one that was found first comes first.
     worth += _STAYS * stays + 0.1 / ((1 + track.number) * (1 + number))
     if count > 2:  # hands of several persons: sides say nothing
@@ -162,12 +163,14 @@ def report_track(
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
     slot, estimate = finish_estimate(slot, taken, estimate, view.fitted.shape, scene.dt_s, model)
+    before = (other for other in state.tracks if other.number < track.number)
+    decided = track.confirmed and all(other.confirmed for other in before)
     slot = changed(
         slot,
         track=track.number,
         side=track.side,
         shape=track.shape,
-        known=track.side if track.confirmed else slot.known,
+        known=track.side if decided else slot.known,
         away_s=slot.away_s if estimate.lost else 0.0,
         joint_features=rows,
     )

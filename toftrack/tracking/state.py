@@ -121,7 +121,8 @@ class Slot:
 
     track: number of the track that is reported here; -1 = none.
     side, shape: of the last track here.  known: the side of the last one that was confirmed, which
-        what is taken for a hand meanwhile does not change; None = none ever was.
+        what is taken for a hand meanwhile does not change; None = none ever was, or a hand that was
+        found before it, and may be the one held out, still is tentative.
     last: the last believed estimate, else the last one; lost and NaN before any.
     gesture: smoothed probabilities of the gestures, None where there are none.
     away_s: how long ago a hand was believed here; inf = never.
