@@ -163,6 +163,7 @@ def report_track(
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
     slot, estimate = finish_estimate(slot, taken, estimate, view.fitted.shape, scene.dt_s, model)
+    # A hand that was found before this one, and is tentative, may be the one held out.
     before = (other for other in state.tracks if other.number < track.number)
     decided = track.confirmed and all(other.confirmed for other in before)
     slot = changed(
