@@ -88,7 +88,7 @@ def report(
         if row is None:
             slot = state.slots[number]
             slot = slot if slot.track in unseen else changed(slot, track=-1)
-            slot, estimate = report_absence(slot, scene.taken, scene.model, len(state.slots))
+            slot, estimate = report_absence(slot, scene.camera_image, scene.model, len(state.slots))
             reports.append((slot, None, estimate))
         else:
             reports.append(report_track(number, results[row], rights[row], state, scene, spans))
@@ -145,9 +145,9 @@ def report_track(
     slot, track, view, model = state.slots[number], one.track, one.view, scene.model
     if slot.track != track.number:
         slot = changed(slot, gesture=None, joint_features=np.zeros_like(slot.joint_features))
-    taken = scene.taken
+    image = scene.camera_image
     estimate = make_estimate(
-        taken, one.filtered, track.pose, one.score, one.status, view.fitted, model
+        image, one.filtered, track.pose, one.score, one.status, view.fitted, model
     )
     score, last = one.score, slot.joint_features
     rows = joint_features(
@@ -162,7 +162,7 @@ def report_track(
         joint_confidence=confidence,
         joint_ok=(confidence >= model.lost.joint_ok) & (not estimate.lost),
     )
-    slot, estimate = finish_estimate(slot, taken, estimate, view.fitted.shape, scene.dt_s, model)
+    slot, estimate = finish_estimate(slot, image, estimate, view.fitted.shape, scene.dt_s, model)
     # A hand that was found before this one, and is tentative, may be the one held out.
     before = (other for other in state.tracks if other.number < track.number)
     decided = track.confirmed and all(other.confirmed for other in before)

@@ -38,20 +38,22 @@ Arm = tuple[np.ndarray, np.ndarray]
 class Scene:
     """A frame's image, dt_s after the last frame, and the hands predicted in it.
 
-    taken: the image in the camera's resolution.
+    camera_image: in the resolution of the camera, which what is reported is of.
     """
 
     tracks: Sequence[Track]
-    taken: DepthImage
+    camera_image: DepthImage
     dt_s: float
     model: TrackerModel
 
     @cached_property
     def image(self) -> DepthImage:
-        """The image that all looks at, see `thinned`, without flying pixels."""
-        depth_m, k = thinned(self.taken.depth_m, self.taken.k)
+        """The image that the networks see and hands are segmented in: thinned, without flying
+        pixels.
+        """
+        depth_m, k = thinned(self.camera_image.depth_m, self.camera_image.k)
         depth_m = without_flying_pixels(depth_m, k, self.model.detector.settings.flying)
-        return replace(self.taken, depth_m=depth_m, k=k)
+        return replace(self.camera_image, depth_m=depth_m, k=k)
 
     @cached_property
     def hands(self) -> tuple[PredictedHand, ...]:
