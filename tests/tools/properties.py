@@ -19,6 +19,7 @@ import numpy as np
 import torch
 
 from toftrack.api import make_hands_tracker
+from toftrack.detector.crops import thinned
 from toftrack.detector.flying_pixels import without_flying_pixels
 
 _JUMP_M = 0.03
@@ -295,9 +296,10 @@ def keypoints(
         for name, (change, *numbers) in PROPERTIES.items() if seen[n] > 0.7 else ():
             f = Frame(depth[n].astype(np.float32), k, joints[n], np.random.default_rng(n))
             change(f, *numbers)
-            image = without_flying_pixels(f.depth_m, f.k, detector.settings.flying)
+            depth_m, of_image = thinned(f.depth_m, f.k)
+            image = without_flying_pixels(depth_m, of_image, detector.settings.flying)
             up = f.joints_m[9] - f.joints_m[0]
-            (first,) = detector.detect(image, f.k, f.palm_m[None], side, up[None])
+            (first,) = detector.detect(image, of_image, f.palm_m[None], side, up[None])
             centre = first.centre_m.numpy()[None]
             (said,) = detector.detect(image, f.k, centre, side, first.up[None])
             off = np.linalg.norm(said.keypoints.points_m.numpy() - f.joints_m, axis=1)

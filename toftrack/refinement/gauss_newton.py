@@ -7,8 +7,8 @@ hand tracking", SGP 2015) with toftrack's ellipsoids:
   * seen points are drawn to the nearest ellipsoid (point to plane along its normal);
   * the bones' axes are drawn into the silhouette where they stick out over the background;
   * the joints are drawn to keypoints, where there are any: joints that somebody else found;
-  * the joint angles are drawn to the filter's estimate, the pose space acting as a prior, and are
-    kept within the joint limits.
+  * the joint angles are drawn to those that the hypothesis began with, and are kept within the
+    joint limits.
 
 Derivatives are analytic: a joint angle moves a point X by a x (X - o), a the joint's axis and o its
 origin, both columns of the kinematic chain's frames. Many hypotheses are refined side by side, by

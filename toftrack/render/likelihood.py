@@ -49,11 +49,11 @@ class Likelihood:
         return Evidence(lowest, highest, hidden, observation.hand, observation.k, radius)
 
     def score(self, counts: Counts) -> Tensor:
-        """(N,) of N hypotheses, 0 .. 1; 0 where nothing is correct."""
+        """(N,) or (B, N), as the counts are: of hypotheses, 0 .. 1; 0 where nothing is correct."""
         raise NotImplementedError
 
     def log_score(self, counts: Counts, coverage: float | None = None) -> Tensor:
-        """(N,) what the filter weighs by, up to a constant: log score + coverage log(correct).
+        """As score, what the filter weighs by, up to a constant: log score + coverage log(correct).
 
         coverage: instead of the likelihood's own, for a search that compares very different poses.
         """
@@ -118,7 +118,7 @@ class FMeasure(Likelihood):
         return super().log_score(counts, coverage)
 
     def score(self, counts: Counts) -> Tensor:
-        """(N,) F-measure, 0 .. 1; 0 where nothing is correct."""
+        """The F-measure, see Likelihood.score."""
         if counts.correct.device.type == "cpu":
             return self._on_host(counts, 0.0, logarithm=False)
         correct, false, missed, residual = counts

@@ -64,7 +64,7 @@ class Evidence:
 
 
 class Counts(NamedTuple):
-    """Pixels of N hypotheses, each (N,) float32 (paper, section 2.3, "Observation").
+    """Pixels of hypotheses, each (N,) or (B, N) float32 (paper, section 2.3, "Observation").
 
     correct: model pixels whose surface lies within the evidence's band.
     false: model pixels that do not, unless hidden.
