@@ -107,7 +107,8 @@ class Estimate:
     """How sure the gesture is, 0..1; NaN where there is none."""
     pinch: float = math.nan
     """How nearly thumb tip and index tip touch, 0 open .. 1 touching; NaN, for which
-    `if pinch` is true, where gesture output is off, the hand is lost, or too little is known of their last joints."""
+    `if pinch` is true, where gesture output is off, the hand is lost, or too little is known of
+    their last joints."""
     pinching: bool = False
     """Whether they pinch: `pinch` with hysteresis, so that one pinch begins and ends once."""
     joint_sigma_m: np.ndarray = _on_demand(21, 3, kind=np.float32)
