@@ -57,7 +57,7 @@ export interface Hand {
   /** Probabilities that the joints are within 40 mm. */
   joint_confidence: (number | null)[];
   /** Which joints may be used. */
-  joint_ok?: boolean[];
+  joint_ok: boolean[];
   /** The index finger's base while it points, metres. */
   pointing_origin_m: Vector;
   /** Unit vector from there to the finger's tip. */

@@ -14,7 +14,7 @@ from helpers.bags import recording, write_bag
 from helpers.tracking import CONF, ROOT, configuration
 from omegaconf import OmegaConf
 
-from toftrack.api import build_tracker
+from toftrack.api import build_tracker, make_device
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
 from toftrack.hand.shape import default_hand_shape
@@ -107,6 +107,13 @@ def test_a_calibrated_camera_reaches_every_device_that_replays(tmp_path: Path) -
     with pytest.raises(hydra.errors.InstantiationException) as caught:
         hydra.utils.instantiate(configuration(f"camera.file='{gone}'").device)
     assert isinstance(caught.value.__cause__, ToftrackError)
+
+
+def test_a_device_that_would_ignore_a_calibrated_camera_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "device").mkdir()
+    (tmp_path / "device" / "own.yaml").write_text("_target_: own.Device\n")
+    with pytest.raises(ToftrackError, match="this device takes no camera.file"):
+        make_device("device=own", "camera.file=lens.json", config_dir=tmp_path)
 
 
 def test_the_same_seed_reaches_the_tracker_and_the_synthetic_device() -> None:

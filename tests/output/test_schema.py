@@ -46,7 +46,7 @@ def test_a_line_that_is_none_is_refused(changes: dict[str, Any]) -> None:
 def test_the_schema_has_each_field() -> None:
     parts = SCHEMA["$defs"]
     assert set(parts["frame"]["properties"]) == set(FRAME_FIELDS)
-    assert set(parts["hand"]["properties"]) == set(HAND_FIELDS)
+    assert set(parts["hand"]["properties"]) == set(parts["hand"]["required"]) == set(HAND_FIELDS)
     assert set(parts["hand"]["properties"]["state_name"]["enum"]) == set(STATES) - {"dropped"}
 
 

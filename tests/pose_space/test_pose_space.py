@@ -190,6 +190,16 @@ def test_poses_that_are_all_the_same_make_no_space(kind: str) -> None:
         fit_pose_space(kind, 4, same)
 
 
+def test_a_space_of_other_dimensions_than_asked_for_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pca = KINDS["pca"]
+    plane = fit_pose_space("pca", 2)
+    monkeypatch.setattr(pca, "fit", lambda *_: plane)
+    with pytest.raises(ToftrackError, match="pca learned 2 dimensions instead of 3"):
+        fit_pose_space("pca", 3)
+
+
 def test_a_wide_kernel_makes_the_coordinates_of_pca() -> None:
     wide = fit_pose_space("kernel_pca", 4, gamma=1e-4).training_latents
     flat = fitted("pca").training_latents
@@ -217,7 +227,7 @@ def rewrite(path: Path, header: dict, **arrays: np.ndarray | None) -> None:
     [
         ({"version": 99}, {}, "version 99"),
         ({"format": "other"}, {}, "not a pose-space file"),
-        ({"kind": "hologram"}, {}, "the pose space kind 'hologram' is unknown; known are isomap"),
+        ({"kind": "hologram"}, {}, "the pose space kind 'hologram' is unknown; known are"),
         ({"angle_names": ["a", "b"]}, {}, "other joint angles"),
         ({"training_labels": ["palm"]}, {}, "bounds or labels do not fit"),
         ({}, {"mean": None}, "no array 'mean'"),

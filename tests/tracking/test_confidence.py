@@ -48,7 +48,6 @@ NO_JOINT_FEATURES = np.zeros((21, len(JOINT_FEATURES)))
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"scale": 0.0}, "joints.scale"),
         ({"kinds": {"wrist": [0, 0, 0, 0]}}, "kinds must have a row for each of wrist, thumb_cmc"),
         ({"weights": dict.fromkeys(JOINT_FEATURES, [1, 2])}, "unsure must be 4 numbers: ray"),
         ({"kinds": dict.fromkeys(KINDS, [0, 0, 0, math.inf])}, "joints.kinds.wrist"),
@@ -280,7 +279,7 @@ def test_a_row_of_weights_is_of_its_column_and_kind() -> None:
     weights = dict.fromkeys(JOINT_FEATURES, nothing) | {"doubt": [0, 0.5, 0, -1.0]}
     features = NO_JOINT_FEATURES.copy()
     features[3, JOINT_FEATURES.index("doubt")] = 2.0
-    sigma, near = JointConfidence(1.0, 0.0, kinds, weights).judge(features)
+    sigma, near = JointConfidence(kinds, weights).judge(features)
     expected = np.full((21, 3), 0.01)
     expected[[8, 12, 16, 20], 0] = 0.02
     expected[3, 1] = 0.01 * math.e

@@ -1,7 +1,7 @@
 """The terms of the posterior, each against plain arithmetic, and what they add up to."""
 
 import itertools
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,9 +12,10 @@ from helpers.settings import posterior_weights
 
 from toftrack.hand.overlap import RADII_MM
 from toftrack.tracking.candidates import View
+from toftrack.tracking.posterior import PosteriorWeights
 
 TRUTH = hand_at()
-NONE = {"keypoints": 0.0, "overlap": 0.0, "other_hand": 0.0}
+NONE = dict.fromkeys((field.name for field in fields(PosteriorWeights)), 0.0)
 
 
 def poses(count: int = 24) -> torch.Tensor:

@@ -40,7 +40,9 @@ CELLS = 16
 OFFSET_M = 0.15
 LOG_SIZE = 0.3
 JOINT_M = 0.05
-"""The scales in which places, sizes and offsets of joints are predicted."""
+"""The scales in which places, sizes and offsets of joints are predicted. Weights are of these, of
+the deviations' below and of ANGLE_LIMITS: another value needs another training, and then
+`fit-confidence`."""
 SIGMA_M, LEAST_SIGMA_M = 0.01, 0.001
 ERROR_M, LEAST_ERROR_M = 0.02, 0.003
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Self
+from typing import Any, Self, cast
 
 from toftrack.errors import ToftrackError, check_number
 from toftrack.frames.camera import Camera
@@ -16,22 +16,23 @@ class BaseDevice:
     Derive from it, write `__iter__`, and `open` and `close` where needed; `open` and the iteration
     raise ToftrackError when the device cannot deliver.
 
+    camera: of the images; None: `open` sets it.
     fps: frames a second, above 0: what it delivers, or what is expected of it.
     """
 
     def __init__(
         self,
-        camera: Camera,
+        camera: Camera | None,
         fps: float = 30.0,
         frames: int | None = None,
         truth: Truth | None = None,
         live: bool = False,
     ) -> None:
         check_number("fps", fps, 0, above=True)
-        if not isinstance(camera, Camera | None):  # None: `open` will set it
+        if not isinstance(camera, Camera | None):
             kind = type(camera).__name__
             raise ToftrackError(f"a device needs Camera(K, width, height), but was given {kind}")
-        self.camera = camera
+        self.camera = cast(Camera, camera)
         """Of the images."""
         self.fps = float(fps)
         """Frames a second, at which the overlay video plays."""

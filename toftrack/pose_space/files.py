@@ -90,7 +90,12 @@ def fit_pose_space(
     # Matrices of some hundred rows: a second thread only waits for the first, four times as long.
     with threadpool_limits(1, "blas"):
         space: PoseSpace = fit(data.angles_rad, data.labels, dims, **settings)
-        return space
+    if space.dims != dims:
+        raise ToftrackError(
+            f"pose_space.kind={kind} learned {space.dims} dimensions instead of {dims}; give"
+            f" pose_space.dims={space.dims}"
+        )
+    return space
 
 
 def save_pose_space(

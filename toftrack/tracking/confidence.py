@@ -229,19 +229,14 @@ _LEAST_CM, _MOST_CM = 0.1, 30.0
 class JointConfidence:
     """The model of a joint's standard deviations and probability; see data/confidence.json.
 
-    scale: times all standard deviations.  odds: added to all log odds.
     kinds: what each kind of joint begins with, in the order of COLUMNS.
     weights: of the features, likewise.
     """
 
-    scale: float
-    odds: float
     kinds: Mapping[str, Sequence[float]]
     weights: Mapping[str, Sequence[float]]
 
     def __post_init__(self) -> None:
-        check_number("joints.scale", self.scale, 0, above=True)
-        check_number("joints.odds", self.odds)
         for name, known in (("kinds", KINDS), ("weights", JOINT_FEATURES)):
             rows = getattr(self, name)
             if set(rows) != set(known):
@@ -265,9 +260,9 @@ class JointConfidence:
     def judge(self, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Standard deviations (21, 3), m, and probabilities (21,) from features (21, J)."""
         predicted = features @ self._weights + self._kinds
-        sigma_cm = self.scale * np.exp(predicted[:, :3].clip(-30.0, 30.0))
+        sigma_cm = np.exp(predicted[:, :3].clip(-30.0, 30.0))
         sigma = sigma_cm.clip(_LEAST_CM, _MOST_CM) / 100
-        odds = (predicted[:, 3] + self.odds).clip(-30.0, 30.0)
+        odds = predicted[:, 3].clip(-30.0, 30.0)
         return sigma.astype(np.float32), (1 / (1 + np.exp(-odds))).astype(np.float32)
 
 
@@ -422,7 +417,7 @@ def make_confidence(fitted: str | None = None, **thresholds: Any) -> ConfidenceM
             LogOdds(float(content[name]["intercept"]), dict(content[name]["weights"]))
             for name in ("every_joint", "whole")
         )
-        joints = JointConfidence(**content["joints"])
+        joints = JointConfidence(*(content["joints"][name] for name in ("kinds", "weights")))
     except (OSError, ValueError, TypeError, KeyError, AttributeError, ToftrackError) as error:
         raise ToftrackError(
             f"lost.fitted='{path}' is no file of a fitted confidence ({error}); give a file of"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Callable
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -107,10 +107,7 @@ def fit_confidence(asked: argparse.Namespace) -> None:
         part: {name: of[name] for name in ("intercept", "weights")}
         for part, of in (("every_joint", summary), ("whole", summary["whole"]))
     }
-    # Scale and odds of the joints are not fitted on rendered sequences: they stay.
-    before = model.lost.joints
-    joints = replace(belief, scale=before.scale, odds=before.odds)
-    write_json(asked.output / "confidence.json", fitted | {"joints": asdict(joints)})
+    write_json(asked.output / "confidence.json", fitted | {"joints": asdict(belief)})
     picture = reliability_figure(expit(log_odds[kept]), seen.right[kept])
     write_picture(asked.output / "reliability.png", picture)
     print(
@@ -193,8 +190,6 @@ def fitted_joint_belief(seen: Observed) -> JointConfidence:
     table = np.column_stack((_plain(sigma, unit), _plain(odds[:, None], every_unit)))
     lines = [[round(float(value), 3) + 0.0 for value in row] for row in table]
     return JointConfidence(
-        scale=1.0,
-        odds=0.0,
         kinds=dict(zip(KINDS, lines, strict=False)),
         weights=dict(zip(JOINT_FEATURES, lines[len(KINDS) :], strict=True)),
     )

@@ -103,5 +103,8 @@ def train(config: DictConfig) -> float:
     print(f"trained in {minutes} minutes{learned}")
     for name in (config.output, *derived, *pictures, "summary.json"):
         print(f"  {folder / name}")
-    print(f"use it: toftrack track detector.weights={path}")
+    print(
+        f"use it: toftrack track detector.weights={path}\n"
+        f"fit its confidence: python -m toftrack.training fit-confidence detector.weights={path}"
+    )
     return error_mm

@@ -32,22 +32,31 @@ class SocketCamera(BaseDevice):
     """The newest image whenever the tracker asks; those that came between are dropped.
 
     timeout_s: so long without an image, and the camera counts as gone.
+    camera_file: a calibrated camera instead of the one that is sent.
     """
 
-    def __init__(self, host: str, port: int, timeout_s: float) -> None:
-        self._where, self._timeout_s = f"{host} port {port}", timeout_s
+    def __init__(
+        self, host: str, port: int, timeout_s: float, camera_file: str | None = None
+    ) -> None:
+        super().__init__(None, live=True)  # what is not known before `open`
+        self._address, self._timeout_s = (host, port), timeout_s
+        self._where, self._camera_file = f"{host} port {port}", camera_file
+        self.description |= {"device": "socket", "where": self._where}
+
+    def open(self) -> None:
+        """Connect, when all else is ready: images that come before are lost."""
         try:
-            self._socket = socket.create_connection((host, port), timeout_s)
+            self._socket = socket.create_connection(self._address, self._timeout_s)
         except OSError as error:
             raise ToftrackError(f"no camera at {self._where} ({error}); {_REMEDY}") from error
         self._images = self._socket.makefile("rb")
         try:
             about = json.loads(self._images.readline(_LONGEST_LINE))
             width, height = int(about["width"]), int(about["height"])
-            self._unit_m, fps = float(about["unit_m"]), float(about["fps"])
-            if not 0 < width * height <= _MOST_PIXELS or not (self._unit_m > 0 and fps > 0):
+            self._unit_m, self.fps = float(about["unit_m"]), float(about["fps"])
+            if not 0 < width * height <= _MOST_PIXELS or not (self._unit_m > 0 and self.fps > 0):
                 raise ValueError("its numbers are not possible")
-            camera = Camera(np.array(about["K"], float), width, height)
+            self.camera = Camera(np.array(about["K"], float), width, height)
         except (ValueError, TypeError, KeyError, OSError) as error:
             self._socket.close()
             raise ToftrackError(
@@ -55,8 +64,8 @@ class SocketCamera(BaseDevice):
                 f" {_REMEDY}"
             ) from error
         self._socket.settimeout(None)  # from here on it is the iteration that waits no longer
-        super().__init__(camera, fps, live=True)
-        self.description |= {"device": "socket", "where": self._where}
+        if self._camera_file is not None:
+            self.camera = Camera.load_for(self._camera_file, width, height, self._where)
 
     def close(self) -> None:
         """Hang up; the sender may end, or serve the next one."""
