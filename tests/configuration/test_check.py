@@ -46,7 +46,7 @@ WRONG = [
     ("device=replya", "there is no device=replya; did you mean device=replay? The choices are"),
     ("pose_space=kpca", "there is no pose_space=kpca; did you mean pose_space=kernel_pca?"),
     ("seed=range(0,3)", "has several values; give one (toftrack track -m"),
-    ("device=replay device.intrinsics=5,5,3,2", 'give one, or a list, "device.intrinsics=[5,5,3'),
+    ("device=replay device.intrinsics=5,5,3,2", 'give one, or "device.intrinsics=[5,5,3,2]" wh'),
     ("device=replay device.K=[5,5,3,2]", "no setting device.K; did you mean device.intrinsics?"),
     ("view=web", "did you mean view=browser?"),
     ("pose_space.file=a.npz pose_space.data=natural", "data=natural is for learning, but pose_"),

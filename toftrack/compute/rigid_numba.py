@@ -1,7 +1,8 @@
 """Compiled scalar geometry on the CPU: rotations, tangent offsets of particles, one hand's pose.
 
 The same formulas as in rigid.py and hand/skeleton.py, without the microseconds that every eager
-operation costs on a few numbers. Quaternions are (x, y, z, w); everything is computed in float64.
+operation costs on a few numbers. Quaternions are (x, y, z, w); everything is
+computed in float64 but latent coordinates, float32.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def compose_rows(reference, tangent, pivot, out):
 
 @entry_point
 def redraw_rows(particles, weights, positions, tangents, lower, upper, folds, pivot, out):
-    """See rigid.redraw; particles, tangents, out: (n, 6 + d), bounds: (d,), float32.
+    """See rigid.redraw; particles: (M, 6 + d), tangents, out: (n, 6 + d), bounds: (d,), float32.
 
     weights: (M,), positions: (n,), pivot: (3,) float64.  folds: outside of the bounds, coordinates
     are folded back instead of truncated.

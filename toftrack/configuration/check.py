@@ -201,7 +201,7 @@ def check_tracker(config: DictConfig, overrides: Sequence[str] = ()) -> None:
     some = ", ".join(given)
     if not given:
         return
-    if refined and "lost=calibrated" in given:
+    if "detector=none" in overrides or (refined and "lost=calibrated" in given):
         raise ToftrackError(
             "detector=none belongs to experiment=paper, the tracker without networks; give"
             " experiment=paper, or leave detector=none out"

@@ -176,7 +176,7 @@ def _of_syntax(error: OverrideParseException) -> str:
 def _of_several(override: str) -> str:
     key, _, value = override.partition("=")
     may_be_list = "(" not in value and not (configuration_folder() / key).is_dir()
-    hint = f', or a list, "{key}=[{value}]"' if may_be_list else ""
+    hint = f', or "{key}=[{value}]" where it takes a list,' if may_be_list else ""
     return f"{override} has several values; give one{hint} (toftrack track -m takes each in turn)"
 
 

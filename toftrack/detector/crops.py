@@ -37,7 +37,8 @@ WIDE_RANGE_M = 1.6
 
 def thinned(depth_m: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """An image (H, W) with no more pixels than crops can use, and its intrinsics (3, 3): of one
-    whose focal length is n times 250 px or more, every n-th row and column.
+    whose focal length is n times 250 px or more, every n-th row and column, so long as
+    _ENOUGH_PIXELS are left.
 
     All that is done with an image takes longer the larger it is.
     """

@@ -25,7 +25,7 @@ VERSION = 1
 DEFAULT_FILE = Path(__file__).parent.parent / "data" / "detector.npz"
 _LARGEST_BYTES = 64 << 20
 _WIDEST = 256
-"""Channels; ten times those of the package's networks."""
+"""Channels; eight times those of the package's networks."""
 _AGAIN = "give other detector.weights, train with python -m toftrack.training train, or reinstall"
 
 

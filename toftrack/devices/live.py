@@ -227,8 +227,6 @@ class SdkCamera(BaseDevice):
             self.close()
             _log.info("%s: frames: %d delivered, %d dropped", self.kind, delivered, self.dropped)
         if not delivered and self._path is not None:
-            if numbers.index < 0:
-                raise ToftrackError(f"'{self._path}' has no frame with depth; record it again")
             raise ToftrackError(
                 f"'{self._path}' has {numbers.index + 1} frames, none from start={self._start} on; "
                 "choose a smaller device.start"
@@ -250,6 +248,8 @@ class SdkCamera(BaseDevice):
                     "done until then is kept)"
                 )
             if time.monotonic() > deadline:
+                if self._path is not None and not begun:
+                    raise ToftrackError(f"'{self._path}' has no frame with depth; record it again")
                 raise ToftrackError(
                     f"no frame has come from the {self.maker} camera for {self._timeout_s:g} s; "
                     "unplug it and plug it in again, into a USB 3 port, or lower device.width, "

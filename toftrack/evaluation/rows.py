@@ -1,4 +1,4 @@
-"""The accuracy of a tracker over recordings and seeds: rows, totals, groups, paired differences.
+"""The accuracy of a tracker over recordings and seeds: rows, totals, groups.
 
 A row is what was measured of one recording with one seed. A recording's figures are means over its
 rows (of `longest_silent` the longest, of `first_right` over the rows that are right at all), totals

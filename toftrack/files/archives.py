@@ -2,9 +2,9 @@
 
 numpy's own reader allocates what a header claims, and Python's `zipfile` decompresses without
 bounds what bzip2 or lzma packed. So headers are checked against the archive's directory first,
-arrays that bzip2 packed, as our samples are, are read by `bz2`, which stops where it is asked to,
-those of lzma are not read, pickled objects never are, and every way in which an archive can be
-broken is a ValueError.
+arrays that bzip2 packed, as most of our samples are, are read by `bz2`, which stops where it is
+asked to, those of lzma are not read, pickled objects never are, and every way in which an archive
+can be broken is a ValueError.
 """
 
 from __future__ import annotations
@@ -115,9 +115,6 @@ class Archive:
         """The bytes of an array, after its header, to be read in turn."""
         with self._opened(name) as (stream, _):
             yield stream
-
-    def close(self) -> None:
-        self._zip.close()
 
     @contextmanager
     def _opened(self, name: str) -> Iterator[tuple[IO[bytes], Header]]:

@@ -305,7 +305,7 @@ class Camera:
             raise ToftrackError(f"in the camera file '{path}', {error}") from None
         except (TypeError, ValueError, OverflowError):
             raise ToftrackError(
-                f"the camera file '{path}' has a width or height that is not a whole number"
+                f"the camera file '{path}' has numbers that cannot be read"
             ) from None
 
     def _corrected(self, measured: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ class Estimate:
     effective_sample_size: float = math.nan
     """Of the weights, before resampling."""
     compute_s: float = math.nan
-    """Wall seconds from the raw frame to the estimate, rectification included, drawing excluded."""
+    """Wall seconds from the raw frame (or `step`'s call) to the estimate, drawing excluded."""
     confidence: float = math.nan
     """Probability that every joint is within 40 mm; NaN where nothing says."""
     outside_rad: float = math.nan

@@ -68,15 +68,15 @@ def median_reading(depth: np.ndarray) -> float:
     return _percentile(depth, 50)
 
 
+def nearest_reading(depth: np.ndarray) -> float:
+    """Likewise what nearly all readings are farther than."""
+    return _percentile(depth, _NEAREST_PERCENT)
+
+
 def could_be_metres(depth: np.ndarray) -> bool | None:
     """Whether its readings can be metres; None where there is none."""
     median = median_reading(depth)
     return _SMALLEST_MEDIAN_M <= median <= LARGEST_MEDIAN_M if median else None
-
-
-def nearest_reading(depth: np.ndarray) -> float:
-    """Likewise what nearly all readings are farther than."""
-    return _percentile(depth, _NEAREST_PERCENT)
 
 
 def _percentile(depth: np.ndarray, percent: float) -> float:
@@ -118,7 +118,7 @@ class Truth:
     joint_visible: np.ndarray | None = None
     """(T, 21) bool."""
     first: int = 0
-    """Number of the first row's frame; the other rows' follow."""
+    """Number of the first row's frame; the other rows' follow where frames do."""
     other: Truth | None = None
     """Of the person's other hand, in the same frames; None where nothing is known of one."""
     pose_name: np.ndarray | None = None

@@ -30,7 +30,7 @@ COUNT = 13
 """Where each feature stands; the fingers from the index to the little one."""
 
 _DISTANCE_RANGES = (1.3, 2.0, 1.6)
-"""From the least to the largest of the three distances within the joint limits, palm lengths."""
+"""About from the least to the largest of the three distances of common poses, palm lengths."""
 _WRIST, _MIDDLE, _LITTLE = (JOINT_NAMES.index(n) for n in ("wrist", "middle_mcp", "little_mcp"))
 _THUMB_TIP, _INDEX_TIP, _MIDDLE_TIP = (
     JOINT_NAMES.index(f"{finger}_tip") for finger in ("thumb", "index", "middle")

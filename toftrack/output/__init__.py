@@ -1,1 +1,1 @@
-"""What leaves the tracker as numbers: results, streams, smoothing, evaluation."""
+"""What leaves the tracker as numbers: results, streams, smoothing."""

@@ -1,6 +1,6 @@
 """What to try when most of a run was lost: a few facts about its lost frames, and what they mean.
 
-The facts are gathered while tracking, from lost frames only, so that a good run pays nothing.
+The facts are gathered while tracking, mostly from lost frames, so that a good run pays little.
 """
 
 from __future__ import annotations

@@ -238,8 +238,8 @@ def read_results(path: str | Path) -> dict[str, Any]:
     """The content of a track.npz: its arrays, with those of `facts_for_readers` as they are now,
     `joint_names` as a tuple and `metadata` as a dict.
 
-    Of a run with `hands=N` above 1 all arrays but index, timestamp_s, compute_s and dropped have
-    an axis of N slots behind that of the frames.
+    Of a run with `hands=N` above 1 the arrays of what is said of hands have an axis of N slots
+    behind that of the frames.
 
     Raises ToftrackError when the file is missing, damaged or not a result.
     """

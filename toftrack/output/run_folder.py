@@ -224,9 +224,11 @@ def read_run(folder: str | Path) -> Run:
     missing = [name for name in FILES if not (folder / name).is_file()]
     if missing:
         read_run_facts(folder)  # which says where it is no run's at all
+        made_anew = {"track.npz", "summary.json"}.issuperset(missing)
+        remedy = f"try `toftrack recover {folder}`" if made_anew else "put it back, or track again"
         raise ToftrackError(
             f"'{folder}' lacks {' and '.join(missing)}, so the run did not finish or the file was "
-            f"moved; try `toftrack recover {folder}`"
+            f"moved; {remedy}"
         )
     results = read_results(folder / "track.npz")
     if not len(results["lost"]):

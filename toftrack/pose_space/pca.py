@@ -17,7 +17,8 @@ class PCAPoseSpace(PoseSpace):
     """A linear space: angles = mean + latent components.
 
     mean: (21,) rad.  components: (d, 21) orthonormal rows.
-    explained_variance_ratio: (21,) of all components, the kept ones first.
+    explained_variance_ratio: (21,), or one a pose where these are fewer, of all components, the
+        kept ones first.
     """
 
     kind: ClassVar[str] = "pca"

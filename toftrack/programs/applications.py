@@ -1,4 +1,4 @@
-"""The two programs that take Hydra's overrides: `toftrack track` and `toftrack train`; and
+"""The two programs that Hydra runs: `toftrack track` and `toftrack train`; and
 `toftrack track FILE`: a recording's name in place of device=replay device.path=FILE.
 """
 

@@ -67,7 +67,7 @@ def draw_figures(
     footage = run.footage(recording)
     figures: dict[str, Callable[[], np.ndarray]] = {}
     if footage is None:
-        if recording is None and frame is not None:
+        if frame is not None:
             raise ToftrackError("a run with a live camera has no images to draw --frame from")
         note(
             "the run tracked a live camera, whose images are not kept; only the figures without "

@@ -194,7 +194,7 @@ class Results:
 
     def draw(self, image: np.ndarray, row: int) -> np.ndarray:
         """The image of a row's frame with the skeletons; see `toftrack.draw`."""
-        from toftrack.views.overlay import draw  # as does OpenCV
+        from toftrack.views.overlay import draw  # takes seconds
 
         camera = self.content["metadata"].get("camera") or {}
         return draw(image, self.estimates(row), np.array(camera.get("K")))

@@ -22,7 +22,7 @@ SHUTDOWN_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(sig
 """The signals that ask a program to end; Windows has no SIGHUP, and alone has SIGBREAK."""
 _PATIENCE = 2
 """So many further requests are let pass while files are finished."""
-_HINT = b"\nfinishing the files; once more ends at once\n"
+_HINT = b"\nfinishing the files; asked %d times more, it ends at once\n"
 
 
 class EndedError(KeyboardInterrupt):
@@ -130,5 +130,6 @@ def _request(number: int, frame: FrameType | None) -> None:
     if _requests.count == 1:
         _requests.waiting = number
     elif number == signal.SIGINT:
-        with suppress(OSError):
-            os.write(2, _HINT)  # print is not for the middle of whatever goes on
+        left = 2 + _PATIENCE - _requests.count
+        with suppress(OSError):  # print is not for the middle of whatever goes on
+            os.write(2, _HINT % left)

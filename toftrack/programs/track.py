@@ -331,6 +331,7 @@ def run_metadata(config: DictConfig, device: Device, tracker: HandsTracker) -> d
             "distortion": camera.distortion.tolist(),
             "lens": camera.lens,
             "depth_polynomial": list(camera.depth_polynomial),
+            "depth_polynomial_range_m": list(camera.depth_polynomial_range_m),
         },
         "config": OmegaConf.to_container(config, resolve=True),
     }

@@ -1,4 +1,4 @@
-"""What looks wrong in a recording: frames counted last, images of nothing, units, times, the lens.
+"""What looks wrong in a recording: images of nothing, units, times, the lens.
 
 What cannot be used at all is an error where it is read; what is said here is a warning, as it may
 be right: the run goes on.

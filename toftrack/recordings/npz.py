@@ -104,7 +104,7 @@ class Recording(FrameStore):
     """What a camera saw, as it lies in the file: depth keeps the file's type."""
 
     depth: Images
-    """(T, H, W) float16 or float32 metres."""
+    """(T, H, W) metres, floats of any size."""
     amplitude: Images | None = None
     """(T, H, W) uint16."""
 

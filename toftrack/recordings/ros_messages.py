@@ -64,7 +64,7 @@ def _pixels(message: Any) -> np.ndarray:
 
 def _decompressed(message: Any) -> np.ndarray:
     words = str(message.format)
-    if not is_depth(words) and not words.startswith("mono16"):
+    if not words.startswith(("16UC1", "32FC1", "mono16")):
         raise ToftrackError(f"it is {_colour(words)}, not depth")
     if not _lossless(words):
         raise ToftrackError(

@@ -49,7 +49,7 @@ _OF_CAMERAS = {"/device_0/sensor_": "realsense", "/cam/sensor_": "orbbec"}
 
 
 def is_bag(path: str | Path) -> bool:
-    """A file `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), or a folder with such files."""
+    """A file `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), or the folder of a ROS 2 bag."""
     if os.path.isdir(path):
         return os.path.exists(os.path.join(path, _METADATA)) or bool(_storages(Path(path)))
     return os.path.splitext(path)[1].lower() in _SUFFIXES
@@ -66,7 +66,8 @@ def _storages(folder: Path) -> list[Path]:
 class RosBag(FrameStore):
     """The depth images of one topic, from the disk one at a time; its times are read at once.
 
-    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml.  given: a lens instead of the
+    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml or
+        the only such file.  given: a lens instead of the
     bag's camera_info; the topic of the depth images, None = the only one there is; metres of one
     step of 16UC1, None = a millimetre, as ROS says.
     """

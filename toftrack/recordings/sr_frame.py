@@ -35,7 +35,7 @@ def unambiguous_range_m(modulation_mhz: int) -> float:
         raise ToftrackError(
             f"the modulation frequency {modulation_mhz} MHz is not one of the SR3000's "
             f"({', '.join(map(str, MODULATION_CODES))} MHz); set device.modulation_mhz to one of "
-            "them"
+            "them (toftrack convert: --modulation)"
         )
     return _LIGHT_M_S / (2e6 * modulation_mhz)
 

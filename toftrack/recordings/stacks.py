@@ -42,8 +42,8 @@ _MOST_RATIO, _SMALL_BYTES, _MOST_CHUNK_BYTES = 1000, 2**26, 2**28
 
 
 class Stack(FrameStore):
-    """The frames of a stack, from the disk as long as this object lives; its kind follows from its
-    name.
+    """The frames of a stack, mostly from the disk as long as this object lives; its kind follows
+    from its name.
 
     given: a lens, or camera.json lies beside the file; the unit of whole numbers (a millimetre) and
     the frame rate (25); of a `.h5` or `.mat` that has several, the dataset.

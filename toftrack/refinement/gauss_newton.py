@@ -11,7 +11,7 @@ hand tracking", SGP 2015) with toftrack's ellipsoids:
     joint limits.
 
 Derivatives are analytic: a joint angle moves a point X by a x (X - o), a the joint's axis and o its
-origin, both columns of the kinematic chain's frames. Many hypotheses are refined side by side, by
+origin, both columns of the kinematic chain's frames. Hypotheses are refined one after the other, by
 gauss_newton_numba.py; the reference in plain torch that it is compared with is
 tests/reference/refinement.py.
 """

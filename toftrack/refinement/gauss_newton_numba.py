@@ -1,6 +1,6 @@
 """Refinement in compiled code: all iterations of gauss_newton.py in one call on the CPU.
 
-Threads share the hypotheses. The formulas and their names are those of the reference in plain
+The formulas and their names are those of the reference in plain
 torch, tests/reference/refinement.py. What a residual says of a point, it says of the frame that
 carries it: the force w = (n, x cross n) along its derivative n. So w w' and w times the residual
 are first summed up frame by frame, and the degrees of freedom come in once for all of them.

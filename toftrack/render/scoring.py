@@ -115,7 +115,8 @@ def disc_steps(square: int, height: int, width: int) -> np.ndarray:
     A disc is a horizontal run for each row offset dy. Each step widens all that came before by a
     pixel to both sides or not (Horner's scheme), and adds the silhouette at row offsets -+ dy.
 
-    Returns (S, 2) int64: a pixel wider or not, and the row offset to add or 0; read only.
+    Returns (S, 2) int64: a pixel wider or not, and the row offset to add or 0; it is kept, so
+    do not write to it.
     """
     offsets = range(min(math.isqrt(square), height) + 1)
     halves = [min(math.isqrt(square - dy**2), width) for dy in offsets] + [0]

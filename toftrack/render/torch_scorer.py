@@ -1,4 +1,4 @@
-"""The scoring back end in plain torch: runs on any device, without anything to compile.
+"""The scoring back end in plain torch: runs on the CPU or CUDA, without anything to compile.
 
 The surface is the ellipsoid in (column, row, inverse depth) of numba/hand.py; here it is evaluated
 over the screen box of each ellipsoid (all particles at once, a loop over ellipsoids).

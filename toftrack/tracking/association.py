@@ -175,7 +175,7 @@ def track_ends(track: Track, confirmed_beside: bool, patience: int) -> bool:
     """Whether a track ends: because it was doubtful for `patience` frames (0 = never), or tentative
     for too long beside a confirmed one.
     """
-    if patience and track.doubtful.begun and track.doubtful.reached(patience):
+    if patience and track.doubtful.reached(patience):
         return True
     return not track.confirmed and confirmed_beside and track.age.seconds > _TENTATIVE_S
 

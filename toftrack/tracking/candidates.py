@@ -259,7 +259,7 @@ def without_things(observation: Observation, parts: Parts) -> Observation:
 
     Else the best pose is one whose fingers explain the thing.
     """
-    if observation.empty or np.count_nonzero(parts.kind == THING_PART) < _LEAST_PARTS:
+    if np.count_nonzero(parts.kind == THING_PART) < _LEAST_PARTS:
         return observation
     thing = _classes(observation, observation.hand, parts) == THING_PART
     if not thing.any():

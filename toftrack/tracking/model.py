@@ -84,7 +84,7 @@ class FittedHand:
     @cached_property
     def derivatives(self) -> tuple[np.ndarray, np.ndarray]:
         """How roots and bones change with the components, see shape_derivatives."""
-        return shape_derivatives(self.first.to("cpu"), torch.tensor(self.applied))
+        return shape_derivatives(self.first, torch.tensor(self.applied))
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from toftrack.compute.threads import small_operations
 from toftrack.compute.transfer import on_device, on_host
 from toftrack.frames.estimate import Estimate, lost_estimate, no_estimate
 from toftrack.frames.frame import DepthImage
-from toftrack.gestures.recognition import tell_gesture
+from toftrack.gestures.recognition import tell_gesture, without_gesture
 from toftrack.hand.conventions import in_all_conventions, with_landmarks
 from toftrack.hand.shape import HandShape
 from toftrack.tracking.association import least_cost
@@ -70,7 +70,7 @@ class TrackResult:
 
 
 StepResult = tuple[TrackerState, tuple[StepInfo | None, ...], tuple[Estimate, ...]]
-"""The next state; per slot what the step saw, None where it has no track; per slot the estimate."""
+"""The next state; per slot what the step saw, None where it saw no hand; per slot the estimate."""
 
 
 def report(
@@ -220,8 +220,7 @@ def report_absence(
     estimate = lost_estimate(slot.last, image.index, image.timestamp_s, math.nan)
     height, width = image.depth_m.shape
     estimate = with_landmarks(estimate, image.k, (width, height))
-    gesture, estimate = tell_gesture(model.gestures, None, estimate, model.space)
-    return changed(slot, gesture=gesture), estimate
+    return changed(slot, gesture=None), without_gesture(estimate)
 
 
 def make_estimate(

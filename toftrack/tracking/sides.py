@@ -91,7 +91,7 @@ def compare_sides(view: View, mirrored: Detection, image: DepthImage, arm: Arm) 
     arm: the hand's.
     """
     evidence, side = view.track.evidence, view.track.side
-    if view.detection.empty or view.detection.present < _LEAST_PRESENT:
+    if view.detection.present < _LEAST_PRESENT:
         return evidence
     turned_lead = _start_turned_looks(mirrored, side, image, view.model)
     gain = _best_of_side(view, view.detection, side)

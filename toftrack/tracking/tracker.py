@@ -29,10 +29,11 @@ _RENDERED_PX = 72, 88
 
 
 class HandsTracker:
-    """Follows `hands` hands, each in a slot of its own: slot 0 is the first one that was found.
+    """Follows `hands` hands, each in a slot of its own. Slot 0 is the first one that was found, or,
+    where a side was told, the hand of that side.
 
     state: all that is carried between frames; one that was kept may be put back.
-    infos: what the last step saw and believed of each; None where it has no track.
+    infos: what the last step saw and believed of each; None where it saw no hand.
     time: what frames take, and what may be spent on them.
     """
 
@@ -184,7 +185,7 @@ class Tracker:
 
     @property
     def info(self) -> StepInfo | None:
-        """What the last step saw and believed; None where it has no track."""
+        """What the last step saw and believed; None where it saw no hand."""
         return self.hands.infos[0]
 
     @property

@@ -7,7 +7,7 @@ to fall. Then, where the schedule says so, the rate rises once more, to less, an
 warm restart (Loshchilov and Hutter, "SGDR: stochastic gradient descent with warm restarts", ICLR
 2017), and the result is the mean of both ends, weight by weight (Izmailov et al., "Averaging
 weights leads to wider optima and better generalization", UAI 2018). On a GPU the processes that
-make images set the pace, one on each core.
+make images set the pace, on all cores but one.
 
 An interrupted training goes on with the batches that it would have seen (batches.py,
 checkpoints.py).
@@ -83,7 +83,7 @@ class Schedule:
 
 
 Course = list[dict[str, Any]]
-"""How training went: a row every few thousand images, with running means of the errors."""
+"""How training went: a row every hundred batches, with running means of the errors."""
 
 
 def train_network(

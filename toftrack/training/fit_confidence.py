@@ -121,7 +121,7 @@ def fit_confidence(asked: argparse.Namespace) -> None:
 def _fitted_frames(
     seen: Observed, y: np.ndarray, kept: np.ndarray
 ) -> tuple[np.ndarray, dict[str, Any]]:
-    """Log odds (T,) of y (T,), the model, and figures about the kept frames."""
+    """Log odds (T,) of y (T,), the model, and figures, those held out of the kept frames."""
     x = seen.features
     intercept, weights = fitted_weights(x[~kept], y[~kept])
     log_odds = intercept + x @ weights

@@ -145,7 +145,7 @@ def posed_hands(
 ) -> Hands:
     """Random hands about given middles of the palm (N, 3); `left` (N,) are mirror images.
 
-    rotation, angles: (N, 3, 3), (N, 21), where they are known; these hands hold no thing.
+    rotation, angles: (N, 3, 3), (N, 21), where they are known; hands of known angles hold nothing.
     known: (N,) which of those given are; None = all of them.
     """
     n = len(pivot_m)

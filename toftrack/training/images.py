@@ -88,7 +88,7 @@ class Crops(NamedTuple):
 
     image: (N, CROP_CHANNELS, CROP, CROP).
     parts: (N, PARTS, PARTS) of SEGMENTS, -1 = not in the image.
-    present: (N,) a hand is seen near the centre.  right: (N,) and it is a right one.
+    present: (N,) a hand is seen near the centre.  right: (N,) it is, or would be, a right one.
     pivot_m: (N, 3).  rotation: (N, 3, 3).  angles: (N, 21).  log_size: (N,).
     joints_m: (N, 21, 3).
     """
@@ -294,7 +294,7 @@ def poorly_read(depth_m: Tensor, lens: Lens, dice: Dice) -> Tensor:
 
 
 def other_hands(hands: Hands, bank: ShapeBank, dice: Dice, touching: Tensor) -> Hands:
-    """Second hands of either side: 10 to 40 cm away from the first ones, or touching them.
+    """Second hands of either side: 7 to 40 cm away from the first ones, or touching them.
 
     touching: (N,) which may touch. Many of these are mirror images of the first ones, as people
     hold up both hands.

@@ -44,7 +44,7 @@ def _mean_hand(device: torch.device) -> HandShape:
 
 def pose_losses(p: Proposed, crops: Crops, anchors: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
     """The loss and what is reported, all () tensors on the network's device. Poses and joints of
-    right hands count; side, parts and presence of all.
+    right hands count, the side of all hands, and parts and presence of all crops.
 
     What does not count has a weight of 0, so that all sizes are the same in each step: a CUDA
     device is told once what to do, see descent.

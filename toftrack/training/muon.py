@@ -3,8 +3,9 @@
 The moving average of a weight matrix's gradients is replaced by the nearest matrix whose singular
 values all are near 1, found by five Newton-Schulz iterations, so that rare directions are learned
 as fast as common ones. Steps have the size of Adam's (Liu et al., "Muon is scalable for LLM
-training", 2025). Biases, norms and the last layers are left to AdamW. With it a training of 176 000
-images is where one with AdamW alone would be after about 1.8 times as many: docs/lab/detector.md.
+training", 2025). Biases, norms, the first and the last layers are left to AdamW. With it a training
+of 176 000 images is where one with AdamW alone would be after about 1.8 times as many:
+docs/lab/detector.md.
 """
 
 from __future__ import annotations
@@ -31,13 +32,13 @@ class Muon(torch.optim.Optimizer):
     """Muon for inner matrices, AdamW for all else, with one learning rate and weight decay."""
 
     def __init__(
-        self, network: nn.Module, last: Iterable[Tensor], rate: float | Tensor, decay: float
+        self, network: nn.Module, ends: Iterable[Tensor], rate: float | Tensor, decay: float
     ):
-        """last: weights that make the network's outputs or see its inputs, left to AdamW.
+        """ends: weights that make the network's outputs or see its inputs, left to AdamW.
 
         rate: may be a () tensor on the network's device, and is read in each step.
         """
-        others = {id(weight) for weight in last}
+        others = {id(weight) for weight in ends}
         inner = [p for p in network.parameters() if p.ndim >= 2 and id(p) not in others]
         chosen = {id(p) for p in inner}
         rest = [p for p in network.parameters() if id(p) not in chosen]

@@ -1,7 +1,8 @@
 """Scenes to train on: a raised hand with its arm, the person, another hand, things, a room.
 
-Everything is drawn at random for a batch at once, as ellipsoids with a label each and planes. All
-lengths are metres in the camera frame of the picture that will be taken.
+Everything is drawn at random for a batch at once, as skins, ellipsoids with a label each, things of
+simple parts, and planes. All lengths are metres in the camera frame of the picture that will be
+taken.
 """
 
 from __future__ import annotations

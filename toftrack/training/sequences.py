@@ -27,7 +27,8 @@ _KEY = 14
 """Frames between two poses that are drawn."""
 _EMPTY_SHARE = 0.25
 _STILL_SHARE = 0.55
-"""Scenes in which the fingers do not move; in hands.HOLDING of them the hand holds a thing."""
+"""Scenes in which the fingers do not move; in hands.HOLDING of them the hand tries to hold a
+thing."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -62,7 +62,7 @@ def rows_of(shape: HandShape, surface: HandSurface, rows: Tensor) -> tuple[HandS
 
 
 def shape_bank(count: int, generator: torch.Generator) -> ShapeBank:
-    """`count` random hands, 135 to 215 mm long.
+    """`count` random hands, 135 to 215 mm long before their proportions vary.
 
     The spreads are wider than those between people (coefficients of variation of 5 to 10 %, ANSUR
     II), so that a real hand, whose surface is no set of ellipsoids, lies within them.

@@ -21,7 +21,7 @@ from toftrack.training.dice import Dice
 
 KINDS = {
     "shown": 0.42,  # SHOWN
-    "pinch": 0.16,  # the thumb's tip on that of any finger, the other fingers as shown
+    "pinch": 0.16,  # the thumb's tip on that of any finger, the other fingers as shown, or any
     "moving": 0.19,  # between two that are shown, or one of them and any fingers
     "any": 0.08,  # each finger straight, half bent, hooked or curled
     "recorded": 0.09,
@@ -33,7 +33,7 @@ KINDS = {
 _STATES = {
     "straight": ((0, 3, 2), (8, 6, 5)),
     "back": ((-14, 4, 0), (8, 5, 5)),  # bent backwards a little, as of a hand stretched out
-    "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 26 to 37 mm off the knuckle
+    "tight": ((86, 105, 65), (5, 6, 8)),  # as a fist closes: the tip is 24 to 35 mm off the knuckle
     "loose": ((74, 92, 45), (11, 12, 14)),
     "folded": ((38, 115, 72), (18, 5, 9)),  # as tight, over knuckles that are bent half or less
     "hooked": ((5, 92, 55), (12, 14, 16)),

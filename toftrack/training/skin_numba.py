@@ -71,7 +71,7 @@ def draw_skin(skin, lens, depth, labels, work):
     width, height = int(lens[3]), int(lens[4])
     f = lens[0]
     xs, ys, zs, union, nearest, which = rays
-    wide = np.float32(2.77) * blend  # the union's polynomial then grows by `blend` at a joint
+    wide = np.float32(2.77) * blend  # the union's polynomial then grows by 0.7 `blend` at a joint
     margin = max(outside, np.float32(0)) + np.float32(1.5) * blend
     columns = (width + TILE - 1) // TILE
     rows = (height + TILE - 1) // TILE

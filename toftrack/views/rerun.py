@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 
 from toftrack.compute.rigid import rotated_pivot
 from toftrack.compute.threads import small_operations
-from toftrack.errors import ToftrackError, reported_errors
+from toftrack.errors import MOST_HANDS, ToftrackError, reported_errors
 from toftrack.files.safe_files import open_new
 from toftrack.frames.estimate import Estimate, gesture_words, is_vacant, state_words
 from toftrack.hand.shape import HandShape
@@ -412,7 +412,7 @@ def _blueprint() -> rrb.Blueprint:
             "+ world/**",
             "- world/camera/amplitude",
             "- world/tracker/**",
-            "- world/tracker_2/**",
+            *(f"- world/tracker_{slot}/**" for slot in range(2, MOST_HANDS + 1)),
         ],
         name="hand, points and particles",
         eye_controls=rrb.EyeControls3D(
