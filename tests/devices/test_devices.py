@@ -8,8 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from toftrack.devices.live import SdkCamera
 from toftrack.devices.replay import Replay
 from toftrack.errors import ToftrackError
+from toftrack.frames.camera import Camera
 
 T, H, W = 12, 6, 8
 K = np.array([[20.0, 0, 4], [0, 20.0, 3], [0, 0, 1]])
@@ -31,6 +33,44 @@ def recording(tmp_path: Path) -> Path:
         metadata='{"who": "a test"}',
     )
     return path
+
+
+class Depthless(SdkCamera):
+    """An SDK's recording whose sets of frames have no depth."""
+
+    kind = maker = "depthless"
+
+    def __init__(self, bag: Path) -> None:
+        self._begin(bag, "every", 2, start=0, stop=None, timeout_s=0.05)
+        self._set_up((W, H), 30.0, False, None, lambda: Camera(K, W, H))
+        self._sets = 3
+        self._pipeline = self
+
+    def _run(self) -> None: ...
+    def stop(self) -> None: ...
+    def get_depth_frame(self) -> None: ...
+
+    def _take(self) -> "Depthless | None":
+        self._sets -= 1
+        return self if self._sets >= 0 else None
+
+    def _over(self) -> bool:
+        return True
+
+    def _plugged_in(self) -> bool:
+        return True
+
+    def _number(self, depth: Any) -> int:
+        raise AssertionError
+
+    def _frame(self, came: Any, depth: Any, index: int) -> Any:
+        raise AssertionError
+
+
+def test_a_recording_of_an_sdk_without_depth_says_so(tmp_path: Path) -> None:
+    (tmp_path / "colour.bag").touch()
+    with pytest.raises(ToftrackError, match="colour.bag' has no frame with depth; record it again"):
+        list(Depthless(tmp_path / "colour.bag"))
 
 
 def test_iterating_again_starts_again_and_a_frame_is_the_callers_own(recording: Path) -> None:

@@ -10,6 +10,7 @@ import tempfile
 import time
 import tracemalloc
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from toftrack.output.lines import KINDS
 from toftrack.programs import in_python
 from toftrack.programs.recover import recover
 from toftrack.recordings.npz import read_recording
+from toftrack.recordings.sr_frame import nominal_camera
 
 PAPER = ("experiment=paper", *QUICK)  # whose tracker is there at once
 WORDS = ("device.name=two_hands", "hands=2", *QUICK)
@@ -108,6 +110,16 @@ def test_results_become_a_table_of_pandas(results: toftrack.Results, monkeypatch
     table = results.to_pandas()
     assert table["index"].tolist() == [0, 0, 1, 1, 2, 2] and table["lost"].dtype == bool
     assert np.allclose(table["wrist_z_m"], results.joints_m[..., 0, 2].ravel())
+
+
+def test_results_name_the_whole_camera_that_was_calibrated(tmp_path: Path) -> None:
+    lens = replace(nominal_camera(), depth_polynomial=(0.001, 0.01))
+    lens = replace(lens, depth_polynomial_range_m=(0.3, 0.9))
+    lens.save(tmp_path / "lens.json")
+    given = (f"camera.file={tmp_path / 'lens.json'}", "device.stop=1", *QUICK)
+    results = toftrack.track("device=sample", *given).results()
+    said = results.content["metadata"]["camera"]
+    assert toftrack.Camera(**said).to_dict() == lens.to_dict()
 
 
 def test_the_device_is_closed_however_the_loop_ends() -> None:
