@@ -11,6 +11,7 @@ import pytest
 
 from toftrack.errors import ToftrackError
 from toftrack.frames.camera import Camera
+from toftrack.frames.frame import checked_image
 
 W, H = 176, 144
 K = np.array([[200.0, 0, 88.5], [0, 210.0, 71], [0, 0, 1]])
@@ -201,3 +202,23 @@ def test_a_matrix_that_no_camera_has_is_refused_with_one_that_is_plausible(place
 )
 def test_unusual_cameras_are_plausible(K: list, size: tuple[int, int]) -> None:
     assert Camera(np.array([*K, [0, 0, 1]]), *size).width == size[0]
+
+
+def test_a_rectified_image_is_the_callers_own() -> None:
+    depth = np.full((H, W), 0.6, np.float32)
+    Camera(K, W, H).rectify(depth, radial=False)[:] = 9.0
+    assert depth.max() < 1
+
+
+def test_what_a_correction_brings_behind_the_camera_is_no_reading() -> None:
+    corrected = Camera(K, W, H, depth_polynomial=(-0.5,)).rectify(
+        np.full((H, W), 0.3, np.float32), radial=True
+    )
+    assert (corrected == 0).all()
+
+
+def test_masked_pixels_are_no_readings() -> None:
+    masked = np.zeros((H, W), bool)
+    masked[:15] = True
+    image, _ = checked_image(np.ma.masked_array(np.full((H, W), 0.6, np.float32), masked), K)
+    assert (image[:15] == 0).all() and (image[15:] > 0).all()

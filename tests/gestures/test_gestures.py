@@ -305,3 +305,17 @@ def test_the_tracker_tells_the_gestures_of_the_recording() -> None:
     reach = scene.joints_m[rows[-1], 8] - scene.joints_m[rows[-1], 5]
     cosine = last.pointing_direction @ reach / np.linalg.norm(reach)
     assert cosine > math.cos(math.radians(15))
+
+
+def test_two_frames_at_once_are_as_one_after_the_other() -> None:
+    first = update(None, seen(pose("palm")), SURE, ON, GESTURES)[0]
+    fist = seen(pose("fist"))
+    once = update(first, fist, SURE, ON, GESTURES, 2.0)[0]
+    twice = update(update(first, fist, SURE, ON, GESTURES)[0], fist, SURE, ON, GESTURES)[0]
+    assert once.probabilities == pytest.approx(twice.probabilities)
+
+
+def test_after_a_second_without_frames_another_gesture_is_told_at_once() -> None:
+    state, _ = tell_gesture(GESTURES, None, estimate(pose("palm")), SPACE)
+    _, reported = tell_gesture(GESTURES, state, estimate(pose("fist")), SPACE, 25.0)
+    assert reported.gesture == "fist"

@@ -79,3 +79,7 @@ def test_one_odd_frame_is_no_pinch_and_ends_none() -> None:
 def test_settings_out_of_range_are_reported(bad: dict[str, float]) -> None:
     with pytest.raises(ToftrackError, match="gestures.pinch"):
         dataclasses.replace(SETTINGS, **bad)
+
+
+def test_fingers_that_touch_in_every_other_frame_do_not_pinch() -> None:
+    assert not any(follow([1.0, 0.0] * 9))

@@ -114,3 +114,9 @@ def test_a_slot_counts_only_where_it_had_a_hand() -> None:
     reported = watch.advice(None)
     assert reported and all(sentence.startswith("Slot 1: ") for sentence in reported)
     assert not any("hand.side" in sentence for sentence in reported)
+
+
+def test_where_no_hand_is_only_the_first_slot_lost_one() -> None:
+    watch = Watch(REACH_M, slots=2)
+    watch.see((LOST, LOST), np.zeros((30, 40), np.float32), (None, None))
+    assert [one.counts["lost"] for one in watch.facts] == [1, 0]

@@ -112,3 +112,8 @@ def test_keys_that_32_bits_cannot_tell_apart_follow_one_another() -> None:
     late = [replace(hand, timestamp_s=t) for hand, t in zip(moving(), times_s, strict=True)]
     time_s, _, _ = exported(late, "right").channels()["Hand_R", "scale"]
     assert (np.diff(time_s) > 0).all() and np.allclose(time_s, times_s, rtol=0, atol=0.001)
+
+
+def test_a_left_hand_is_exported_as_one_though_the_file_of_its_shape_says_right() -> None:
+    (motion,) = motions_of(run_of(moving("left"), default_hand_shape(side="right")))
+    assert motion.shape.side == "left"

@@ -67,3 +67,9 @@ def test_an_occluder_is_part_of_the_silhouette_and_has_no_points() -> None:
     seen, plain = seen_points(covered), seen_points(observation)
     assert len(seen.points_m) == 0
     assert torch.equal(seen.beside, plain.beside)
+
+
+def test_a_thing_in_the_hand_is_no_background() -> None:
+    seen = observed(0)
+    held = replace(seen, hand=torch.zeros_like(seen.hand), thing=seen.hand.clone())
+    assert torch.equal(seen_points(held).beside, seen_points(seen).beside)

@@ -56,3 +56,10 @@ def test_a_slow_movement_after_rest_is_followed_soon() -> None:
 def test_a_jump_is_taken_at_once() -> None:
     path = followed([*trembling(20), hand(0.2)])
     assert float(path[-1, 0]) > 0.19
+
+
+def test_a_movement_is_forgotten_by_the_time_and_not_by_the_frame() -> None:
+    two = 2 * FRAME_S
+    _, trend = steadied(hand(0.001 * 2), hand(), torch.full((27,), 0.5), two, rigid.MOTIONS)
+    one = steadied(hand(0.001), hand(), torch.full((27,), 0.5), FRAME_S, rigid.MOTIONS)[1]
+    assert float(trend[10]) == pytest.approx(float(one[10]) ** 2 / 0.5, rel=1e-4)

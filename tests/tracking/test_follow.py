@@ -4,10 +4,12 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from helpers.detection import FixedDetector, detection_of
 from helpers.rendered import (
+    EMPTY,
     hand_at,
     image_of,
     right_hand_model,
@@ -19,6 +21,8 @@ from helpers.rendered import (
 from helpers.settings import confidence_model
 
 from toftrack.compute.pace import FRAME_S, Duration, Spans
+from toftrack.detector.network import PARTS
+from toftrack.detector.parts import HAND_PART, Parts
 from toftrack.detector.proposals import SAME_PLACE_M
 from toftrack.tracking.association import keep_tracks
 from toftrack.tracking.candidates import View
@@ -26,7 +30,7 @@ from toftrack.tracking.confidence import LogOdds
 from toftrack.tracking.filter import predict_particles
 from toftrack.tracking.report import TrackResult
 from toftrack.tracking.state import ParticleSet, Track
-from toftrack.tracking.step import filter_tracks, step, update_track
+from toftrack.tracking.step import filter_tracks, miss_track, step, update_track
 
 HERE, THERE = hand_at(0.0), hand_at(SAME_PLACE_M + 0.05)
 IMAGE = image_of(HERE, THERE)
@@ -176,6 +180,7 @@ WAITING = track_of(THERE, confirmed=False, age=Duration(0.6))
         ((SURE, track_of(hand_at(0.05), log_odds=3.0)), [0, 1]),
         ((SURE, track_of(THERE, **NEW)), [0, 1]),
         ((track_of(HERE, **LONG_DOUBTED), track_of(THERE, **LONG_DOUBTED, **NEW)), []),
+        ((track_of(HERE, log_odds=9.0, **LONG_DOUBTED), LESS_SURE), [1]),
         ((SURE, WAITING), [0]),
         ((WAITING,), [0]),
         ((WAITING, track_of(HERE, confirmed=False)), [0, 1]),
@@ -190,6 +195,7 @@ WAITING = track_of(THERE, confirmed=False, age=Duration(0.6))
         "two that lie beside each other go on",
         "and two that are apart",
         "what nobody sees ends, whether it was a hand or not",
+        "and takes nobody with it",
         "a tentative one ends beside a confirmed one",
         "but not alone",
         "nor beside a tentative one",
@@ -217,3 +223,32 @@ def test_what_hides_a_hand_is_not_expected_to_be_it() -> None:
     scene = scene_of(plain, behind, image=IMAGE)
     free, hidden = (hand.expected.nearest_m for hand in scene.hands)
     assert free < 0.5 and hidden == pytest.approx(0.55, abs=0.01)
+
+
+def test_a_hand_that_a_frame_does_not_show_is_not_reliable_any_more() -> None:
+    scene = scene_of(track_of(HERE, likely=Duration(FRAME_S)), image=EMPTY)
+    after = miss_track(scene, 0)
+    assert not after.likely.begun and after.doubtful.begun
+    assert after.believed_s == pytest.approx(FRAME_S)
+
+
+def test_hands_at_one_place_draw_different_particles() -> None:
+    views = [view_of(IMAGE, replace(track_of(HERE), number=number)) for number in (0, 1)]
+    tracks = [view.track for view in views]
+    scene = scene_of(*tracks, image=IMAGE)
+    first, second = filter_tracks(views, state_of(*tracks, hands=2), scene, 3, Spans()).values()
+    assert not torch.equal(first.particles, second.particles)
+
+
+def test_a_search_whose_places_wait_for_the_next_frame_is_a_search() -> None:
+    image = replace(IMAGE, timestamp_s=FRAME_S)
+    after, _, _ = step(state_of(track_of(HERE)), image, right_hand_model())
+    assert after.searched_s == 0.0
+
+
+def test_what_the_network_said_of_pixels_holds_where_it_does_not_look() -> None:
+    parts = Parts(np.full((PARTS, PARTS), HAND_PART, np.uint8), np.eye(3), np.ones(3), False)
+    track = track_of(HERE, parts=parts)
+    view, scene = view_of(IMAGE, track), scene_of(track, image=IMAGE)
+    particles = filter_tracks([view], state_of(track), scene, 0, Spans())[track.cloud]
+    assert update_track(view, particles, scene, Spans()).track.parts is parts

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from helpers.rendered import EMPTY, any_hand_model, hand_at, scene_of, state_of, track_of, view_of
 
 from toftrack.compute.pace import Spans
 from toftrack.frames.estimate import Estimate
 from toftrack.frames.frame import DepthImage
 from toftrack.tracking.confidence import JOINT_FEATURES, Status
-from toftrack.tracking.report import TrackResult, report
+from toftrack.tracking.report import TrackResult, covariance_of, report
 from toftrack.tracking.state import SideEvidence, Track, TrackerState
 
 IMAGE = replace(EMPTY, index=5, timestamp_s=0.2)
@@ -269,3 +270,31 @@ def test_what_is_known_of_a_hand_s_joints_holds_and_not_of_another_hand_s(
     found = state.slots[0].joint_features
     assert (found[:, :3] == 7.0 * holds).all(), "the network was not asked"
     assert (found != 7.0).any()
+
+
+def test_how_long_ago_a_hand_was_believed_grows_while_it_is_lost() -> None:
+    state, _ = reported(before(track=0, away_s=3.0), hand(0, lost=True))
+    assert state.slots[0].away_s == 3.0
+
+
+def test_of_several_slots_one_that_a_frame_does_not_show_forgets_its_gesture() -> None:
+    track = hand(0)
+    state, _ = reported(before(2), track)
+    state, _, _ = report(state, [], scene_of(track, image=EMPTY, model=any_hand_model()), Spans())
+    assert state.slots[0].track == 0 and state.slots[0].gesture is None
+
+
+def test_landmarks_of_a_lost_hand_are_of_the_image_that_is_there() -> None:
+    state, (seen,) = reported(before(), hand(0))
+    larger = replace(IMAGE, depth_m=np.zeros((288, 352), np.float32))
+    _, (lost,) = reported(state, image=larger)
+    assert not np.allclose(lost.landmarks[:, 0], seen.landmarks[:, 0])
+
+
+def test_particles_that_turn_about_the_wrist_leave_its_place_certain() -> None:
+    model, cloud = any_hand_model(), track_of(hand_at()).cloud
+    particles = cloud.particles.clone()
+    particles[:, 3] += torch.linspace(-0.3, 0.3, len(particles))
+    covariance = covariance_of(replace(cloud, particles=particles), model)
+    least = model.model_variance[:3].numpy()
+    assert np.diag(covariance)[:3] == pytest.approx(least, rel=1e-3)
