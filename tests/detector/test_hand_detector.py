@@ -86,7 +86,6 @@ def test_hands_are_detected_twice_at_the_places_that_were_found(monkeypatch) -> 
     detections, inspected = looked(monkeypatch, found_at(*centres), merit=-1e6)
     assert len(inspected) == 2 and len(detections) == 3
     assert inspected[0] == pytest.approx(np.array(centres))
-    assert 1 <= len(inspected[1]) <= 3
     away = np.linalg.norm(inspected[1][:, None] - inspected[0], axis=-1).min(1)
     assert (away > 0).all(), "about the palms that the first one found"
 
