@@ -118,6 +118,8 @@ def test_each_level_leaves_out_more() -> None:
         assert less.filter == model.filter
         assert less.hand("right", first_shape()) is model.hand("right", first_shape())
         before = less
+    rarely = make_tracker("hand.side=right", "detector.every=9").model
+    assert all(rarely.at_quality(level).detector.settings.every == 9 for level in LEVELS)
 
 
 def test_less_quality_may_be_one_thread() -> None:

@@ -231,6 +231,8 @@ def test_the_log_odds_are_smoothed_over_time_but_in_a_first_frame() -> None:
     cases = ((older, FRAME_S), (older, 2 * FRAME_S), (new, FRAME_S))
     found = [judge(track, features, dt_s, model).log_odds for track, dt_s in cases]
     assert found == pytest.approx([0.0, 1.0, 2.0])
+    whole = judge(followed(log_odds=5.0, whole_odds=-4.0), features, FRAME_S, model).whole_odds
+    assert whole == pytest.approx(-2.0)
 
 
 def test_probabilities_are_those_of_the_log_odds_and_finite() -> None:

@@ -138,6 +138,8 @@ def test_while_no_hand_is_followed_any_is_looked_for_of_the_told_side_if_one_was
 ) -> None:
     detector, seen, _ = looked(found=FOUND, told=told)
     assert detector.looked == sides and len(seen) == 2 * len(sides)
+    both, *_ = looked(found=FOUND, told=told, hands=2)
+    assert both.looked == ["right", "left"], "of two hands each"
 
 
 @pytest.mark.parametrize(

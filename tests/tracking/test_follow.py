@@ -90,7 +90,7 @@ def test_a_pose_of_another_place_begins_the_track_anew_there() -> None:
     after = followed(wrong, 2.0, at=THERE).track
     assert after.pose[0, 0] == pytest.approx(float(THERE[0, 0]), abs=0.01)
     assert after.age == Duration(FRAME_S) and after.number == wrong.number
-    assert not after.velocity.any()
+    assert not after.velocity.any() and after.trend.isnan().all()
 
 
 def test_it_is_kept_what_was_asked_and_what_hides_the_hand() -> None:

@@ -144,6 +144,16 @@ def began(new: Sequence[SideDetection], *tracks: Track, image: DepthImage = BOTH
     return [view for view in views if view is not None]
 
 
+def test_a_hand_that_comes_back_keeps_the_shape_that_was_learned() -> None:
+    used = model()
+    state = state_of(model=used)
+    learned = replace(state.slots[0].shape, poses=9.0)
+    state = replace(state, slots=(replace(state.slots[0], side="right", shape=learned),))
+    scene = scene_of(image=BOTH, model=used)
+    view = begin_track(scene, SideDetection(detection_of(HERE), "right"), 7, state)
+    assert view is not None and view.track.shape.poses == 9.0
+
+
 def test_a_track_begins_tentatively_at_the_pose_that_explains_the_image() -> None:
     truth = bent(HERE, 1, 0.3)
     detection = detection_of(torch.cat((HERE, bent(HERE, 2, 0.8), truth)))
