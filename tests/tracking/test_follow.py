@@ -86,7 +86,7 @@ def test_the_particles_follow_the_pose_that_was_found() -> None:
 
 
 def test_a_pose_of_another_place_begins_the_track_anew_there() -> None:
-    wrong = track_of(hand_at(0.2), doubtful=Duration(0.1))
+    wrong = track_of(hand_at(0.2), doubtful=Duration(0.1), trend=torch.ones(27))
     after = followed(wrong, 2.0, at=THERE).track
     assert after.pose[0, 0] == pytest.approx(float(THERE[0, 0]), abs=0.01)
     assert after.age == Duration(FRAME_S) and after.number == wrong.number
