@@ -1,5 +1,6 @@
 """Devices: the frames of a recording, in order, as they were recorded."""
 
+import itertools
 import json
 import time
 from pathlib import Path
@@ -107,6 +108,13 @@ def test_range_outside_the_recording_is_reported(recording: Path, start: Any, st
         Replay(recording, start=start, stop=stop)
     with pytest.raises(ToftrackError, match="start=a is not possible"):
         Replay(recording, start="a", stop=stop)
+
+
+def test_a_recording_that_repeats_goes_on_in_number_and_time(recording: Path) -> None:
+    frames = list(itertools.islice(Replay(recording, repeat=True), 2 * T + 1))
+    assert [frame.index for frame in frames] == list(range(2 * T + 1))
+    assert np.diff([frame.timestamp_s for frame in frames]) == pytest.approx(0.01)
+    assert np.array_equal(frames[-1].depth, frames[0].depth)
 
 
 def test_realtime_drops_what_comes_too_late(

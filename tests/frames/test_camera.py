@@ -154,6 +154,8 @@ def test_save_and_load_keep_the_lens(tmp_path: Path, count: int) -> None:
         ({"distortion": [0, 0]}, "4, 5, 8, 12, 14 numbers.*has 2"),
         ({"lens": "mirror"}, "opencv or fisheye.*mirror"),
         ({"depth_polynomial": [0.1] * 10**5}, "100000 coefficients"),
+        ({"depth_polynomial_range_m": [1.5, 0.3]}, "nearest, then farthest"),
+        ({"depth_polynomial_range_m": [[1], [1, 2]]}, "has numbers that cannot be read"),
     ],
 )
 def test_bad_camera_file_is_reported(tmp_path: Path, change: dict[str, Any], words: str) -> None:
