@@ -272,7 +272,7 @@ def test_what_is_known_of_a_hand_s_joints_holds_and_not_of_another_hand_s(
     assert (found != 7.0).any()
 
 
-def test_how_long_ago_a_hand_was_believed_grows_while_it_is_lost() -> None:
+def test_a_lost_hand_was_not_believed_now() -> None:
     state, _ = reported(before(track=0, away_s=3.0), hand(0, lost=True))
     assert state.slots[0].away_s == 3.0
 

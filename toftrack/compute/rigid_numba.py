@@ -1,8 +1,8 @@
 """Compiled scalar geometry on the CPU: rotations, tangent offsets of particles, one hand's pose.
 
 The same formulas as in rigid.py and hand/skeleton.py, without the microseconds that every eager
-operation costs on a few numbers. Quaternions are (x, y, z, w); everything is
-computed in float64 but latent coordinates, float32.
+operation costs on a few numbers. Quaternions are (x, y, z, w); everything is computed in float64
+but latent coordinates, which are float32.
 """
 
 from __future__ import annotations

@@ -90,13 +90,12 @@ def check_overrides(config: DictConfig, name: str, overrides: Sequence[str]) -> 
     """
     check_interpolations(config)
     check_tracker(config, overrides)
-    device = config.get("device")
-    if device is not None and OmegaConf.select(config, "camera.file") is not None:
-        if "camera.file" not in OmegaConf.to_yaml(device):
-            raise ToftrackError(
-                "this device takes no camera.file: its file in conf/device has no line like"
-                " 'camera_file: ${camera.file}'; leave camera.file out, or add one"
-            )
+    given, device = OmegaConf.select(config, "camera.file"), config.get("device")
+    if given is not None and device is not None and "camera.file" not in OmegaConf.to_yaml(device):
+        raise ToftrackError(
+            "this device takes no camera.file: its file in conf/device has no line like"
+            " 'camera_file: ${camera.file}'; leave camera.file out, or add one"
+        )
     space = config.get("pose_space") or {}
     of_file = space.get("file") is not None and str(space.get("_target_")).startswith("toftrack.")
     for word in overrides if of_file else ():

@@ -66,8 +66,7 @@ def _storages(folder: Path) -> list[Path]:
 class RosBag(FrameStore):
     """The depth images of one topic, from the disk one at a time; its times are read at once.
 
-    path: a `.bag`, `.mcap` or `.db3`, or a folder with metadata.yaml or
-        the only such file.  given: a lens instead of the
+    path: a `.bag`, `.mcap` or `.db3`, or the folder of a ROS 2 bag.  given: a lens instead of the
     bag's camera_info; the topic of the depth images, None = the only one there is; metres of one
     step of 16UC1, None = a millimetre, as ROS says.
     """

@@ -62,9 +62,9 @@ _READ = "a folder of images, .npz, .zip, .npy, .tif, .h5, .mat, .mkv, .avi, .bag
 
 def open_recording(path: str | Path, given: Given = NOTHING_GIVEN) -> FrameStore:
     """Open a recording of a kind in docs/formats.md, or that an installed package reads, by its
-    name, with the camera that is given, or its own. Large ones are read
-    image by image where the format allows it. Raises
-    ToftrackError: it cannot be used, or it says itself what is given; one sentence that names it.
+    name, with the camera that is given, or its own. Large ones are read image by image where the
+    format allows it. Raises ToftrackError: it cannot be used, or it says itself what is given; one
+    sentence that names it.
     """
     store = open_with_own_camera(path, given)
     size = store.camera.width, store.camera.height
